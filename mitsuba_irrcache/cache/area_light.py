@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_direct_light
-from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, spread
+from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, mean_over, spread
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
 from mitsuba_irrcache.core.spectrum import channel_mean
@@ -236,7 +236,7 @@ class AreaLight(DirectLight):
         rng = random_stream(mi.sample_tea_32(first, second))
         length, depth = self._length_to(p, self._solid_angle.closest(p)), self.depth(p)
         depth = depth if isinstance(depth, mi.Float) else channel_mean(depth)
-        mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), 0)
+        mean = mean_over(length, depth, 0)
         return self._mean_residual(basis, p, direction, mean, self._phase_samples, rng, peak_depth)
 
     @symbolic

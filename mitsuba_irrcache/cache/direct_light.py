@@ -183,20 +183,15 @@ class DirectLight:
     ) -> GridField:
         """Create the field of the mean extinction, given optical depths at the voxels."""
         sigma_t = self._medium.sigma_t.at_world(self._centres)
-        return self._field_of_extinction(self._over_length(depth, sigma_t), classes)
+        mean = mean_over(self.length(self._centres), depth, sigma_t)
+        return self._field_of_extinction(mean, classes)
 
     def _extinction_of_peak(self, classes: VoxelClasses | None) -> GridField:
         """Create the field of the mean extinction of the forward peak over `length`."""
         ray, near, far = DirectLight._line(self, self._centres)
-        mean = self._over_length(peak_depth(self._medium, ray, near, far, near < far), 0)
+        depth = peak_depth(self._medium, ray, near, far, near < far)
+        mean = mean_over(self.length(self._centres), depth, 0)
         return _on_grid(self._grid, self._voxels, mean, classes)
-
-    def _over_length(
-        self, depth: mi.Float | mi.Color3f, otherwise: mi.Float | mi.Color3f | int
-    ) -> mi.Float | mi.Color3f:
-        """Return optical depths at the voxels over `length`, or ``otherwise`` where that is 0."""
-        length = self.length(self._centres)
-        return dr.select(length > 0, depth / dr.select(length > 0, length, 1), otherwise)
 
     def _field_of_extinction(
         self, mean: mi.Float | mi.Color3f, classes: VoxelClasses | None
@@ -275,6 +270,13 @@ def direct_lights_of(
     if dense and medium.is_isolated:
         emitters = EmittersByKind(scene.emitters()).of(EmitterKind.SUN, *POINT_LIKE)
     return [DirectLight(scene, emitter, medium, grid, voxels, classes) for emitter in emitters]
+
+
+def mean_over(
+    length: mi.Float, depth: mi.Float | mi.Color3f, otherwise: mi.Float | mi.Color3f | int
+) -> mi.Float | mi.Color3f:
+    """Return the mean extinction of an optical ``depth``; ``otherwise`` where the length is 0."""
+    return dr.select(length > 0, depth / dr.select(length > 0, length, 1), otherwise)
 
 
 def _on_grid(

@@ -10,7 +10,6 @@ the order of one machine.
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -23,16 +22,20 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.jobs import UnfitWorkerError
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
-from mitsuba_irrcache.out_of_core.slab_sweep import AxisSweep, Carried, PairsOfOrdinates
+from mitsuba_irrcache.out_of_core.slab_sweep import (
+    EXTINCTION_FILE,
+    AxisSweep,
+    Carried,
+    PairsOfOrdinates,
+)
 from mitsuba_irrcache.out_of_core.slab_tracks import SlabTracks
 from mitsuba_irrcache.out_of_core.slabs import Slab, even_slabs
 
 #: Pairs of ordinates of a job, at most, and slabs of an axis, about at least: with more of both
 #: more workers have something to do, and reading and writing takes a larger share.
 PAIRS, FEWEST_SLABS = 8, 8
-#: Name of the file of the quantised extinction.
-LEVELS = "extinction"
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class SweepPlan:
         name: of the sweep, which begins the names of its files.
         shape: voxels (z, y, x).
         to_world: of the voxels.
-        quantum: of the extinction in the file `LEVELS` [1/scene unit].
+        quantum: of the extinction in the file `EXTINCTION_FILE` [1/scene unit].
         memory: bytes of a worker.
         ordinates: of all dominant axes.
         incoming: (n, 2, channels).
@@ -75,9 +78,8 @@ class SweepPlan:
             "incoming": self.incoming,
             "source": np.frombuffer(self.source.encode(), np.uint8),
         }
-        data = io.BytesIO()
-        np.savez(data, **arrays)
-        _replace(folder / f"{self.name}.plan.npz", data.getvalue())
+        with atomic_write(folder / f"{self.name}.plan.npz") as file:
+            np.savez(file, **arrays)
 
     @classmethod
     def load(cls, folder: Path, name: str) -> SweepPlan:
@@ -98,7 +100,7 @@ class SweepPlan:
     def sweeps(self, folder: Path) -> list[AxisSweep]:
         """Return the sweeps of all dominant axes, with the files that they read."""
         grid = Grid(self.shape, self.to_world)
-        levels = BrickFile.existing(folder / LEVELS, self.shape, np.uint16)
+        levels = BrickFile.existing(folder / EXTINCTION_FILE, self.shape, np.uint16)
         source = None
         if self.source:
             source = BrickFile.existing(folder / self.source, self.shape, np.float32, self.channels)
@@ -308,9 +310,3 @@ def _write(path: Path, values: np.ndarray) -> None:
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise IrrcacheError(f'cannot write "{path}": {error.strerror or error}') from None
-
-
-def _replace(path: Path, data: bytes) -> None:
-    partial = path.with_name(f"{path.name}.{uuid4().hex}.tmp")
-    partial.write_bytes(data)
-    os.replace(partial, path)

@@ -49,6 +49,8 @@ MOST_VALUES = 1 << 30
 MOST_SLICES = 128
 #: Share of the memory for the radiance of the tracks.
 SHARE_CARRIED = 0.4
+#: Name of the working file of the quantised extinction.
+EXTINCTION_FILE = "extinction"
 
 Progress = Callable[[int, int], None]
 #: directions (n, 3), weights (n) and offsets (n, 2) of pairs of ordinates, as `Tracks.table` takes
@@ -66,7 +68,7 @@ class SlabSweep:
         self.grid, self._folder, self._memory = sigma_t.grid, folder, memory
         #: whether sweeps with a source would distinguish the halves of voxels in memory
         top, self.is_dense = largest_extinction(self.grid, sigma_t.largest)
-        self._levels = self.file("extinction", np.uint16)
+        self._levels = self.file(EXTINCTION_FILE, np.uint16)
         write_levels(self._levels, sigma_t, top, memory)
         self._tracks = SlabTracks(self.grid, top / LEVELS)
 

@@ -286,7 +286,7 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
 def warn_of_opaque_voxels(medium: MediumGrid, grid: Grid, max_depth: int) -> None:
     """Log a warning if voxels are too opaque for several orders of scattering."""
     data = (medium.original or medium).sigma_t.grid
-    if max_depth == 2 or data is None or medium.homogeneous:
+    if max_depth == 2 or data is None:
         return
     sigma_t = _colliding_extinction(medium)
     edge, size = data.voxel_size.max(), grid.voxel_size.max()
