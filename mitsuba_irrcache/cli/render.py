@@ -15,9 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache import __version__
-from mitsuba_irrcache.core.argument_types import share, whole
+from mitsuba_irrcache.core.argument_types import argument, finite, share, whole
 from mitsuba_irrcache.core.stage_display import StageDisplay
 from mitsuba_irrcache.errors import IrrcacheError, origin
+from mitsuba_irrcache.io.display import TONES, Display, linear_colour
 from mitsuba_irrcache.io.images import check_output, write_image
 from mitsuba_irrcache.io.scene_files import (
     check_scene_file,
@@ -34,6 +35,8 @@ from mitsuba_irrcache.pipeline.progressive import Frame, render_progressive
 
 #: Stock integrators that ``irrcache`` replaces when a scene uses one of them.
 REPLACED = ("path", "volpath", "volpathmis", "prbvolpath")
+
+_colour = argument("a colour such as white or #202530")(linear_colour)
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
@@ -100,7 +103,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="choose resolution, directions, steps and, without --spp, samples per pixel for this "
         "error of the image in units of its mean, e.g. 0.5%%, and print the estimated error",
     )  # fmt: skip
+    add_display_options(parser)
     parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
+
+
+def add_display_options(parser: argparse.ArgumentParser) -> None:
+    """Declare how the PNG displays the image; the EXR stays linear radiance."""
+    parser.add_argument(
+        "--exposure", type=finite, default=0.0, metavar="EV", help="of the PNG, in stops"
+    )
+    parser.add_argument(
+        "--tone", choices=tuple(TONES), default="sRGB", help="tone curve of the PNG"
+    )
+    parser.add_argument(
+        "--background", type=_colour, metavar="COLOUR",
+        help="behind the image in the PNG, e.g. white or #202530; for films with alpha "
+        "(pixel_format rgba), where emitters are hidden or there is no environment",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -129,6 +148,7 @@ def run(args: argparse.Namespace) -> int:
             f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), "
             "counted from 0."
         )
+    _check_background(scene, args)
     if args.budget or args.error:
         _require_progressive(scene, integrator or integrator_of(source, parameters))
         _render_progressive(scene, args, seconds, output, display)
@@ -136,7 +156,7 @@ def run(args: argparse.Namespace) -> int:
         image = _render(scene, args, seconds, display)
         if args.tolerance:
             print(scene.integrator().certificate)
-        _write(output, image, scene, _describe(scene, args, seconds), seconds)
+        _write(output, image, scene, args, seconds)
     return 0
 
 
@@ -205,8 +225,7 @@ def _render_progressive(
     finally:
         if frame is not None:
             seconds |= frame.seconds
-            about = _describe(scene, args, seconds, frame.samples)
-            _write(output, np.array(frame.image), scene, about, seconds)
+            _write(output, np.array(frame.image), scene, args, seconds, frame.samples)
 
 
 def _add_message_to_interrupt(error: BaseException, left: str) -> None:
@@ -226,10 +245,13 @@ def _write(
     output: Path,
     image: np.ndarray,
     scene: mi.Scene,
-    about: dict[str, object],
+    args: argparse.Namespace,
     seconds: dict[str, float],
+    samples: int = 0,
 ) -> None:
-    png = write_image(output, image, about, scene.integrator().aov_names())
+    about = _describe(scene, args, seconds, samples)
+    display = Display(args.exposure, args.tone, args.background)
+    png = write_image(output, image, about, scene.integrator().aov_names(), display)
     print(f"wrote {output} and {png}")
     print("  ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
@@ -288,6 +310,14 @@ def _check_targets(args: argparse.Namespace) -> None:
     ):
         if value is not None and not 0 < value < math.inf:
             raise IrrcacheError(f"--{name} is {value:g}; it must be {wanted} above 0.")
+
+
+def _check_background(scene: mi.Scene, args: argparse.Namespace) -> None:
+    film = scene.sensors()[args.sensor].film()
+    if args.background is not None and not mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+        raise IrrcacheError(
+            "--background needs a film with alpha; set its pixel_format to rgba in the scene."
+        )
 
 
 def _require_progressive(scene: mi.Scene, integrator: str) -> None:

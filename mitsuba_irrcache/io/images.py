@@ -10,6 +10,7 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.display import PLAIN, Display
 
 #: Channel names of an image by their number.
 CHANNELS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
@@ -34,12 +35,13 @@ def write_image(
     image: np.ndarray,
     metadata: dict[str, object],
     further: Sequence[str] = (),
+    display: Display = PLAIN,
 ) -> Path:
     """Write ``image`` (height, width, channel), linear radiance, to an EXR and an sRGB PNG.
 
     The channels are luminance or RGB, optionally alpha, followed by those named in ``further``,
     which are stored in the EXR only. ``metadata`` is stored in its header with the prefix
-    ``irrcache:``. Returns the path of the PNG.
+    ``irrcache:``; ``display`` affects the PNG only. Returns the path of the PNG.
     """
     path = check_output(path)
     image = np.ascontiguousarray(image, dtype=np.float32)
@@ -53,7 +55,7 @@ def write_image(
         )
     _write(buffer, path, oiio.FLOAT)
     png = path.with_suffix(".png")
-    buffer = oiio.ImageBuf(np.ascontiguousarray(image[..., :shown]))
+    buffer = oiio.ImageBuf(np.ascontiguousarray(display.apply(image[..., :shown])))
     _write(oiio.ImageBufAlgo.colorconvert(buffer, "linear", "sRGB"), png, oiio.UINT8)
     return png
 

@@ -183,13 +183,12 @@ class Document:
     def save(
         self,
         path: Path,
-        camera: Camera,
-        size: tuple[int, int],
+        sensor: ElementTree.Element,
         medium: bool,
         integrator: dict[str, tuple[str, str]],
         note: str,
     ) -> list[Path]:
-        """Save the scene as seen by ``camera``, with a film of ``size`` (width, height).
+        """Save the scene as seen by a ``sensor``, see `sensor_of`.
 
         Volumes are written if they are not on disk yet. ``medium`` says whether the camera is
         inside the medium; ``integrator`` holds properties to set, as (kind, value) by name;
@@ -198,8 +197,8 @@ class Document:
         root = ElementTree.fromstring(self._text(self._root))
         for default in root.findall("default"):
             root.remove(default)
-        for sensor in root.findall("sensor"):
-            root.remove(sensor)
+        for former in root.findall("sensor"):
+            root.remove(former)
         node = root.find("integrator")
         for name, (kind, value) in integrator.items():
             _set(node, kind, name, value)
@@ -214,7 +213,6 @@ class Document:
                     string.set("value", file.name)
                 elif (self.folder / name).exists():
                     string.set("value", str((self.folder / name).resolve()))
-        sensor = _sensor(camera, size)
         if medium:
             inside = next(root.iter("medium"))
             inside.set("id", inside.get("id") or MEDIUM_ID)
@@ -361,8 +359,13 @@ def _unit(vector: Sequence[float]) -> np.ndarray:
     return np.asarray(vector, dtype=np.float64) / np.linalg.norm(vector)
 
 
-def _sensor(camera: Camera, size: tuple[int, int]) -> ElementTree.Element:
-    """Return a ``perspective`` sensor with a box filter, as the viewer uses."""
+def sensor_of(
+    camera: Camera, size: tuple[int, int], with_alpha: bool = False
+) -> ElementTree.Element:
+    """Return a ``perspective`` sensor with a box filter, as the viewer uses.
+
+    Its film has this ``size`` (width, height).
+    """
     sensor = ElementTree.Element("sensor", type="perspective")
     _set(sensor, "float", "fov", repr(camera.fov))
     _set(sensor, "string", "fov_axis", "y")
@@ -379,7 +382,7 @@ def _sensor(camera: Camera, size: tuple[int, int]) -> ElementTree.Element:
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
     _set(film, "integer", "width", str(size[0]))
     _set(film, "integer", "height", str(size[1]))
-    _set(film, "string", "pixel_format", "rgb")
+    _set(film, "string", "pixel_format", "rgba" if with_alpha else "rgb")
     _set(film, "string", "component_format", "float32")
     ElementTree.SubElement(film, "rfilter", type="box")
     return sensor

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import tempfile
+import threading
 import zipfile
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import viser
@@ -14,9 +16,13 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.animation import MOST_FRAMES, along_path, turntable, write_frames
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.editing import Editing
-from mitsuba_irrcache.view.keep import checked_name, keep
+from mitsuba_irrcache.view.keep import checked_name, keep, render_command
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import View
+
+
+class Cancelled(Exception):  # noqa: N818 (not an error: the user asked for it)
+    """Raised to end an export."""
 
 
 class ExportPanel:
@@ -34,7 +40,7 @@ class ExportPanel:
         seen: Callable[[], View | None],
     ) -> None:
         self._client, self._session, self._folder, self._seen = client, session, folder, seen
-        self._gone = False
+        self._gone, self._cancelled = False, threading.Event()
         gui = client.gui
         with gui.add_folder("Save", order=6, expand_by_default=False):
             self._name = gui.add_text("name", "view")
@@ -53,11 +59,13 @@ class ExportPanel:
             add = gui.add_button("add this view to the path", color="gray")
             clear = gui.add_button("clear the path", color="gray")
             export = gui.add_button("export path", hint="a smooth path through the views")
-            self._exported = gui.add_markdown("PNG frames, and a video with imageio-ffmpeg")
+            self._cancel = gui.add_button("cancel", color="red", visible=False)
+            self._exported = gui.add_markdown(_what_is_exported())
         turn.on_click(lambda _: editing.submit("turn", self._export_turntable))
         add.on_click(lambda _: editing.submit("add", self._add_knot))
         clear.on_click(lambda _: editing.submit("clear", self._clear_path))
         export.on_click(lambda _: editing.submit("path", self._export_path))
+        self._cancel.on_click(lambda _: self._cancelled.set())
         self._save.on_click(lambda _: editing.submit("save", self._keep))
 
     def close(self) -> None:
@@ -68,16 +76,17 @@ class ExportPanel:
         name = checked_name(self._name.value)
         view = self._seen()
         if view is None:
-            return
+            raise IrrcacheError("there is nothing to save before the first image.")
         self._saved.content = "saving ..."
+        command = f"; the same image by\n```\n{render_command(name, view.look)}\n```"
         try:
             if self._folder is not None:
                 self._folder.mkdir(exist_ok=True)
                 files = keep(self._session, view, self._folder, name, self._cache.value)
-                self._saved.content = "saved " + ", ".join(f.name for f in files)
+                self._saved.content = "saved " + ", ".join(f.name for f in files) + command
             else:
                 self._download(view, name)
-                self._saved.content = f"downloaded {name}.zip"
+                self._saved.content = f"downloaded {name}.zip{command}"
         except Exception:
             self._saved.content = ""
             raise
@@ -111,7 +120,25 @@ class ExportPanel:
             self._exported.content = f"frame {done} of {len(cameras)} ..."
             if self._gone:
                 raise IrrcacheError("the window was closed during an export.")
+            if self._cancelled.is_set():
+                raise Cancelled
 
+        self._cancelled.clear()
+        self._cancel.visible = True
+        try:
+            self._write(name, view, cameras, tell)
+        except Cancelled:
+            written = "" if self._folder is None else f"; its frames are in {name}"
+            self._exported.content = f"the export was cancelled{written}"
+        except Exception:
+            self._exported.content = ""
+            raise
+        finally:
+            self._cancel.visible = False
+
+    def _write(
+        self, name: str, view: View, cameras: list[Camera], tell: Callable[[int], None]
+    ) -> None:
         tell(0)
         rate = float(self._rate.value)
         if self._folder is not None:
@@ -135,3 +162,9 @@ class ExportPanel:
             for file in files:
                 archive.write(file, file.name)
         self._client.send_file_download(f"{name}.zip", packed.getvalue(), save_immediately=True)
+
+
+def _what_is_exported() -> str:
+    if find_spec("imageio_ffmpeg"):
+        return "PNG frames, and a video (MP4)"
+    return "PNG frames; a video, too, after `pip install imageio-ffmpeg`"

@@ -7,8 +7,10 @@ from pathlib import Path
 
 from mitsuba_irrcache import __version__
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.display import hex_of
 from mitsuba_irrcache.io.images import write_image, write_pixels
-from mitsuba_irrcache.view.picture import Samples
+from mitsuba_irrcache.view.document import sensor_of
+from mitsuba_irrcache.view.picture import Look, Samples
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import SAMPLES, View
 
@@ -31,21 +33,20 @@ def checked_name(name: str) -> str:
 def keep(
     session: Session, view: View, folder: Path, name: str, with_cache: bool = False
 ) -> list[Path]:
-    """Write ``name``.png (the displayed image), .exr (radiance and layers) and .xml.
+    """Write ``name``.png (the displayed image), .exr (radiance and layers) and ``name``-scene.xml.
 
-    The XML is a scene of which ``irrcache render`` makes the same image. With ``with_cache`` the
-    caches are written too. Returns the files. Blocks until they are written, while the session goes
-    on displaying images.
+    The scene's `render_command` makes the same image, under names of its own. With ``with_cache``
+    the caches are written too. Returns the files. Blocks until they are written, while the session
+    goes on displaying images.
     """
     path = Path(folder) / checked_name(name)
     if not path.parent.is_dir():
         raise IrrcacheError(f'cannot write to "{folder}": there is no such folder.')
-    with session.reserved():
-        samples = _samples(session, view, layered=True)
-        plain = _samples(session, view, layered=False) if not view.look.layered else samples
-    exr, png, xml = (path.with_name(f"{name}.{kind}") for kind in ("exr", "png", "xml"))
+    exr, png = (path.with_name(f"{name}.{kind}") for kind in ("exr", "png"))
 
-    def write() -> list[Path]:
+    def write(samples: Samples, plain: Samples) -> list[Path]:
+        if session.has_edit:
+            raise IrrcacheError("the scene was changed while it was saved; save the view again.")
         light = session.light
         image, names = samples.channels(SAVED_AOVS, view.look.filtered)
         about = {
@@ -57,9 +58,29 @@ def keep(
         write_image(exr, image, about, names)
         write_pixels(png, plain.picture(view.look, session.extent(view.camera)))
         caches = _write_caches(session, path) if with_cache else {}
-        return [exr, png, *caches.values(), *_write_scene(session, view, xml, samples, caches)]
+        return [exr, png, *caches.values(), *_write_scene(session, view, path, samples, caches)]
 
-    return session.call(write)
+    with session.reserved():
+        samples = _samples(session, view, layered=True)
+        plain = _samples(session, view, layered=False) if not view.look.layered else samples
+        return session.call(lambda: write(samples, plain))
+
+
+def scene_name(name: str) -> str:
+    """Return the name of a saved scene; images that are rendered of it replace none of the view."""
+    return f"{name}-scene.xml"
+
+
+def render_command(name: str, look: Look) -> str:
+    """Return the command that renders the saved scene of a view as it is displayed."""
+    words = ["irrcache render", scene_name(name)]
+    if look.exposure:
+        words.append(f"--exposure {look.exposure:g}")
+    if look.tone != Look().tone:
+        words.append(f"--tone {look.tone}")
+    if any(look.background):
+        words.append(f"--background '{hex_of(look.background)}'")
+    return " ".join(words)
 
 
 def _samples(session: Session, view: View, layered: bool) -> Samples:
@@ -92,14 +113,16 @@ def _write_caches(session: Session, path: Path) -> dict[str, Path]:
 
 
 def _write_scene(
-    session: Session, view: View, xml: Path, samples: Samples, caches: dict[str, Path]
+    session: Session, view: View, path: Path, samples: Samples, caches: dict[str, Path]
 ) -> list[Path]:
-    light = session.light
+    light, xml = session.light, path.with_name(scene_name(path.name))
     properties = {"cache_spp": ("integer", str(max(light.samples, 0)))}
     if caches:
-        properties["cache_file"] = ("string", str(xml.with_suffix(".cache").resolve()))
+        properties["cache_file"] = ("string", str(path.with_name(f"{path.name}.cache").resolve()))
     if view.look.filtered:
         properties["filter"] = ("string", "bilateral")
     inside = samples.seen.medium_at(view.camera.position) is not None
-    note = f"irrcache view: {view.look.kind}, exposure {view.look.exposure:g}, {view.look.tone}"
-    return session.document.save(xml, view.camera, view.size, inside, properties, note)
+    look = view.look
+    note = f"irrcache view: {look.kind}, exposure {look.exposure:g}, {look.tone}"
+    sensor = sensor_of(view.camera, view.size, with_alpha=any(look.background))
+    return session.document.save(xml, sensor, inside, properties, note)

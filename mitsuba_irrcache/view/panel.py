@@ -28,28 +28,31 @@ class LightPanel:
 
     def __init__(self, server: viser.ViserServer, session: Session, channel: Channel) -> None:
         self._session, self._channel = session, channel
-        gui, lighting = server.gui, session.document.lighting
+        gui, document, lighting = server.gui, session.document, session.document.lighting
         with gui.add_folder("Light", order=3):
             self._status = gui.add_markdown("")
             self._refusal = gui.add_markdown("", visible=False)
             self.editing = Editing(self.refuse)
-            if session.document.has_environment:
+            if document.has_environment:
                 self._light("environment", lighting.environment, 0.0, 10.0, gui)
             self._sun = self._light("sun", lighting.sun, 0.0, 1000.0, gui)
             gui.add_html("<irrcache-light></irrcache-light>")
+            if document.has_environment:
+                self._light("rotation", lighting.rotation, -180.0, 180.0, gui, slider=True)
             hidden = gui.add_checkbox(
-                "hide emitters", session.document.seeing.hide_emitters,
+                "hide emitters", document.seeing.hide_emitters,
                 hint='they light the medium, but are not seen: "background" is',
             )  # fmt: skip
             self.editing.bind(
                 hidden, lambda value: session.edit(lambda d: d.set_hide_emitters(value))
             )
         with gui.add_folder("Scattering and error", order=4, expand_by_default=False):
-            self._add_details(gui, lighting)
+            self._add_details(gui)
         channel.receive("sun", self._turn_sun)
+        channel.receive("angles", self._set_angles)
         self._tell_light()
 
-    def _add_details(self, gui: viser.GuiApi, lighting: Lighting) -> None:
+    def _add_details(self, gui: viser.GuiApi) -> None:
         document = self._session.document
         density = gui.add_number(
             "density, ×", document.density, min=0.001, max=1000.0, step=0.01,
@@ -66,12 +69,6 @@ class LightPanel:
         self.editing.bind(density, self._set_density)
         self.editing.bind(depth, self._set_depth)
         self.editing.bind(target, self._set_target)
-        if document.has_environment:
-            self._light("rotation", lighting.rotation, -180.0, 180.0, gui, slider=True)
-        self._azimuth = self._light("azimuth", lighting.azimuth, -180.0, 180.0, gui, slider=True)
-        self._elevation = self._light(
-            "elevation", lighting.elevation, -90.0, 90.0, gui, slider=True
-        )
 
     def show(self, status: Status) -> None:
         """Display the progress of the cache refinement; called in the session's thread."""
@@ -114,23 +111,30 @@ class LightPanel:
             raise ValueError("the direction to the sun is no vector")
 
         def change() -> None:
-            document = self._session.document
-            azimuth, elevation = document.angles(direction)
-            lighting = document.lighting
-            sun = lighting.sun or SUN
-            turned = replace(lighting, azimuth=azimuth, elevation=elevation, sun=sun)
-            self._session.edit(lambda d: d.set_lighting(turned))
-            self._sun.value = sun
-            self._azimuth.value, self._elevation.value = round(azimuth), round(elevation)
-            self._tell_light()
+            self._light_from(*self._session.document.angles(direction))
 
         self.editing.submit("sun", change)
+
+    def _set_angles(self, value: object) -> None:
+        """Queue angles of the sun, in degrees, which a browser sent; switch it on if needed."""
+        azimuth = _number("azimuth", value["azimuth"], -360.0, 360.0)
+        elevation = _number("elevation", value["elevation"], -90.0, 90.0)
+        self.editing.submit("sun", lambda: self._light_from(azimuth, elevation))
+
+    def _light_from(self, azimuth: float, elevation: float) -> None:
+        lighting = self._session.document.lighting
+        sun = lighting.sun or SUN
+        turned = replace(lighting, azimuth=azimuth, elevation=elevation, sun=sun)
+        self._session.edit(lambda d: d.set_lighting(turned))
+        self._sun.value = sun
+        self._tell_light()
 
     def _tell_light(self) -> None:
         """Send the direction to the sun to the components of all windows."""
         document = self._session.document
-        towards = document.towards_sun.round(4).tolist()
-        self._channel.send("lighting", {"towards": towards, "sun": document.lighting.sun})
+        towards, lighting = document.towards_sun.round(4).tolist(), document.lighting
+        angles = {"azimuth": lighting.azimuth, "elevation": lighting.elevation}
+        self._channel.send("lighting", {"towards": towards, "sun": lighting.sun} | angles)
 
     def _edit_light(self, name: str, value: float) -> None:
         def change(document: Document) -> None:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.spectrum import luminance
+from mitsuba_irrcache.io.display import TONES
 from mitsuba_irrcache.render.aovs import AOVS, Layers
 from mitsuba_irrcache.render.denoise import filter_illumination
 from mitsuba_irrcache.render.film import PixelPositions
@@ -35,12 +36,6 @@ CAPTIONS = {
 ERROR_SCALE = 10.0
 #: Exposures in stops that can be chosen.
 EXPOSURES = (-8.0, 8.0)
-#: Tone curves; all are followed by the sRGB transfer function.
-TONES: dict[str, Callable] = {
-    "sRGB": lambda c: c,
-    "Reinhard": lambda c: c / (1 + dr.maximum(c, 0)),
-    "filmic": lambda c: _filmic(dr.maximum(c, 0)),
-}
 #: Pixels traced in one launch. It is the same for all images, since all random numbers depend on
 #: it.
 BAND = 1 << 16
@@ -244,15 +239,11 @@ def _display(
 ) -> np.ndarray:
     """Return pixels in sRGB; transmittance and depth ignore the exposure."""
     if look.kind not in ("transmittance", "depth", "colour"):
-        colour = TONES[look.tone](colour * dr.opaque(mi.Float, 2.0**look.exposure))
+        colour = dr.maximum(colour, 0) * dr.opaque(mi.Float, 2.0**look.exposure)
+        colour = TONES[look.tone](colour)
     width, height = size
     colour = dr.clip(colour + behind, 0, 1)
     curved = dr.select(colour <= 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
     r, g, b = (mi.UInt32(c * 255 + 0.5) for c in curved)
     packed = np.array((r | (g << 8) | (b << 16)) + dr.zeros(mi.UInt32, width * height))
     return packed.view(np.uint8).reshape(height, width, 4)[..., :3]
-
-
-def _filmic(c: mi.Color3f) -> mi.Color3f:
-    """Apply a tone curve with a toe and a shoulder (K. Narkowicz's fit of ACES)."""
-    return c * (2.51 * c + 0.03) / (c * (2.43 * c + 0.59) + 0.14)

@@ -7,6 +7,7 @@ of ``x`` without the noise of the reference.
 
 from __future__ import annotations
 
+import math
 from time import perf_counter
 
 import drjit as dr
@@ -96,10 +97,11 @@ class ViewReference:
         return whole.reshape(height, n, width, n, 3).mean(axis=(1, 3))
 
     def error_of(self, image: np.ndarray) -> tuple[float, float] | None:
-        """Return the relative RMSE of ``image`` (height, width, 3) and the smallest detectable one.
+        """Return bounds between which the relative RMSE of ``image`` (height, width, 3) lies.
 
-        Both are in units of the mean radiance, and exclude the noise of the reference. Returns None
-        until both halves cover the image, and if the reference is black.
+        Both are in units of the mean radiance, and exclude the noise of the reference, of which
+        they are two standard errors away from the estimate. Returns None until both halves cover
+        the image, and if the reference is black.
         """
         if self._passes < 2:
             return None
@@ -108,11 +110,11 @@ class ViewReference:
         if not mean > 0:
             return None
         apart = self.reduced(image).reshape(-1, 3)
-        square = float(((apart - a) * (apart - b)).mean())
-        # The mean of products of independent noise has a standard error of variance / sqrt(n).
-        noise = float(((a - b) ** 2).mean()) / 2
-        resolved = np.sqrt(noise * np.sqrt(2 / a.size))
-        return float(np.sqrt(max(square, 0.0))) / mean, float(resolved) / mean
+        # The noise of the channels of a pixel is not independent, that of pixels is.
+        products = ((apart - a) * (apart - b)).mean(axis=-1)
+        square, spread = float(products.mean()), 2 * float(products.std()) / np.sqrt(products.size)
+        low, high = max(square - spread, 0.0), max(square, 0.0) + spread
+        return float(np.sqrt(low)) / mean, float(np.sqrt(high)) / mean
 
     def comparison(self, image: np.ndarray) -> str:
         """Describe the difference of ``image`` (height, width, 3) from the reference in words."""
@@ -125,9 +127,7 @@ class ViewReference:
         found = self.error_of(image)
         if found is None:
             return told
-        error, resolved = found
-        amount = f"{error:.2%}" if error > resolved else f"below {resolved:.2%}"
-        return f"{told}; RMSE {amount} of the mean, its noise taken out"
+        return f"{told}; RMSE {between(*found)} of the mean, its noise taken out"
 
     def signed_error(self, image: np.ndarray) -> np.ndarray:
         """Return the error of ``image``, mean over the channels, in units of the mean radiance.
@@ -160,6 +160,15 @@ class ViewReference:
         colour, _, _ = self._integrator.sample(self.light.scene, sampler, ray, self._inside)
         planes = mi.Color3f(colour.x) if mi.is_monochromatic else mi.Color3f(colour)
         return np.stack([np.broadcast_to(np.array(p), count) for p in planes], axis=-1)
+
+
+def between(low: float, high: float) -> str:
+    """Describe an error between two bounds, by the upper one only where its value is unclear."""
+    if high > 2 * low:
+        return f"below {float(f'{100 * high:.2g}'):g} %"
+    error, spread = 50 * (low + high), 50 * (high - low)
+    digits = max(-math.floor(math.log10(spread)), 0) if spread > 0 else 2
+    return f"{error:.{digits}f} ± {spread:.{digits}f} %"
 
 
 def _seed(number: int, first: int) -> int:

@@ -14,7 +14,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from time import monotonic, perf_counter
+from time import monotonic, perf_counter, sleep
 
 import drjit as dr
 import mitsuba as mi
@@ -148,12 +148,22 @@ class Session:
 
     @contextmanager
     def reserved(self) -> Iterator[None]:
-        """Suspend refinement within this context; calls and new views are still processed."""
+        """Suspend refinement within this context; calls and new views are still processed.
+
+        It begins when the last edit is displayed.
+        """
+        while self.has_edit and self._thread.is_alive():
+            sleep(CHECK_SECONDS)  # a call would interrupt the solver
         self.call(lambda: self._reserve(1))
         try:
             yield
         finally:
             self.call(lambda: self._reserve(-1))
+
+    @property
+    def has_edit(self) -> bool:
+        """Return whether an edit is not displayed yet."""
+        return self._light not in (None, self._shown)
 
     @property
     def light(self) -> Light:
@@ -269,7 +279,7 @@ class Session:
             return True
         if self._reserved:
             return False
-        if self._light is not None and self._light is not self._shown:
+        if self.has_edit:
             return self._improve()  # an edit is displayed only after its first refinement
         for _ in range(len(self._chores)):
             self._chores.rotate()

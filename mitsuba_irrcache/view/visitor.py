@@ -16,12 +16,13 @@ import viser
 from PIL import Image
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.display import TONES, linear
 from mitsuba_irrcache.view.camera import NARROWEST, WIDEST, Camera
 from mitsuba_irrcache.view.channel import Channel
 from mitsuba_irrcache.view.comparison import CHOICES, Compared, described
 from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.export_panel import ExportPanel
-from mitsuba_irrcache.view.picture import CAPTIONS, EXPOSURES, KINDS, MARKED, TONES, Look
+from mitsuba_irrcache.view.picture import CAPTIONS, EXPOSURES, KINDS, MARKED, Look
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
 
@@ -100,16 +101,13 @@ class Visitor:
             self._filter = gui.add_checkbox(
                 "filter", False, hint="of the illumination; weaker as the caches converge"
             )
-            self._background = gui.add_rgb(
-                "background", (0, 0, 0), hint="where emitters are hidden, see the group Light"
-            )
-        for handle in (
-            self._kind, self._exposure, self._tone, self._filter, self._background, self._compare
-        ):  # fmt: skip
+            gui.add_html("<irrcache-background></irrcache-background>")
+        for handle in (self._kind, self._exposure, self._tone, self._filter, self._compare):
             self.editing.bind(handle, lambda _: self._set_look())
         self.editing.bind(self._sensor, lambda name: self._go_to(name))
         self.editing.bind(self._fov, self._set_fov)
         self._reset.on_click(lambda _: self._go_to(self._sensor.value))
+        self._channel.receive("background", self._set_background, self._key)
         self._export = ExportPanel(self.client, self.session, self.folder, self.editing, self._seen)
 
     def _set_look(self) -> None:
@@ -122,9 +120,21 @@ class Visitor:
             raise IrrcacheError("volpath does not render the emission of media.")
         if self._compare.value == "off":  # what is shown until the next image is ours alone
             self._channel.send("comparison", {"mode": "off"}, self._key)
-        colour = tuple(_linear(c) for c in self._background.value)
+        colour = self._look.background
         self._look = Look(kind, float(exposure), tone, bool(self._filter.value), colour)
         self._look_again()
+
+    def _set_background(self, value: object) -> None:
+        """Queue a colour that the browser sent, as sRGB values in [0, 1]."""
+        red, green, blue = (linear(max(0.0, min(1.0, float(c)))) for c in value)
+        colour = red, green, blue
+
+        def change() -> None:
+            self._look = replace(self._look, background=colour)
+            self._channel.send("background", value, self._key)
+            self._look_again()
+
+        self.editing.submit("background", change)
 
     def _set_fov(self, degrees: float) -> None:
         if not NARROWEST <= degrees <= WIDEST:
@@ -244,9 +254,3 @@ class Visitor:
             pixels = io.BytesIO()
             Image.fromarray(found.reference).save(pixels, "JPEG", quality=RESTING_QUALITY)
             send("reference", pixels.getvalue(), key)
-
-
-def _linear(value: int) -> float:
-    """Return the linear value of an 8-bit channel in sRGB."""
-    c = min(max(value, 0), 255) / 255
-    return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4

@@ -16,7 +16,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 
 FOLDER = Path(__file__).with_name("page")
-SCRIPTS = ("channel.js", "transfer.js", "light.js", "overlay.js")
+SCRIPTS = ("channel.js", "transfer.js", "light.js", "background.js", "overlay.js")
 
 
 @cache

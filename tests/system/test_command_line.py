@@ -160,6 +160,7 @@ BAD_CALLS = {
     "output folder": (["scene.xml", "-o", "nowhere/a.exr"], "nowhere.*does not exist"),
     "output format": (["scene.xml", "-o", "a.jpg"], r"a\.jpg.*\.exr"),
     "sensor": (["scene.xml", "-s", "2"], r"--sensor is 2.*2 sensor"),
+    "background without alpha": (["scene.xml", "--background", "white"], r"film with alpha.*rgba"),
     "samples": (["scene.xml", "--spp", "-3"], "--spp is -3"),
     "definition": (["scene.xml", "-D", "density"], "-D .density"),
     "missing volume": (["scene.xml", "-D", "density=gone.vol"], r"gone\.vol"),

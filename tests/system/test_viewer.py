@@ -77,7 +77,7 @@ def test_edit_save_reload_and_second_window(browser, started):
     window.unfold("Save")
     window.page.get_by_role("button", name="save view", exact=True).click()
     window.page.get_by_text("saved view").wait_for(state="attached")  # whether folded or not
-    kept = folder / "kept" / "view.xml"
+    kept = folder / "kept" / "view-scene.xml"
     assert main(["render", str(kept), "-o", str(folder / "again.exr")]) == 0
     again = np.rint(255 * read_image(folder / "again.png"))
     assert again.shape == closer.shape
@@ -116,6 +116,28 @@ def test_edit_save_reload_and_second_window(browser, started):
     other.page.get_by_role("button", name="save view", exact=True).click()
     other.page.get_by_text("is no name for a file").first.wait_for()
     assert not list(folder.parent.glob("escaped*")) and not list(folder.glob("escaped*"))
+
+    # The background has a name of CSS; other words are refused beside it.
+    other.unfold("Camera, tone, background")
+    field = other.page.locator("irrcache-background input[type=text]")
+    field.fill("blurple")
+    field.press("Enter")
+    other.page.get_by_text('"blurple" is no colour').wait_for()
+    field.fill("white")
+    field.press("Enter")
+    corner = finally_(other, lambda shot: shot[-40, 10:40].min() > 250)
+    assert difference(corner, elsewhere) > 50
+    # Keys with Ctrl move no camera, but undo wherever the focus is.
+    points = other.curve()
+    other.drag_point(8, 150, 0.02)
+    other.page.mouse.click(20, 20)
+    other.page.wait_for_function("document.querySelector('irrcache-transfer').state.undo")
+    shown = len(other.shown())
+    other.page.keyboard.press("Control+a", delay=200)
+    other.page.keyboard.press("Control+z")
+    other.page.wait_for_function("!document.querySelector('irrcache-transfer').state.undo")
+    assert other.curve() == points
+    assert not [s for s in other.shown()[shown:] if s["width"] < elsewhere.shape[1]]
 
     # A reload preserves the shared state.
     other.page.reload()

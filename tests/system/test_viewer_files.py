@@ -151,7 +151,7 @@ def test_transfer_functions_and_archives_are_exchanged(browser, reachable, tmp_p
     with zipfile.ZipFile(archive) as packed:
         packed.extractall(tmp_path / "kept")
     assert {f.suffix for f in (tmp_path / "kept").iterdir()} == {".png", ".exr", ".xml", ".vol"}
-    kept = tmp_path / "kept" / "view.xml"
+    kept = tmp_path / "kept" / "view-scene.xml"
     assert main(["render", str(kept), "-o", str(tmp_path / "again.exr")]) == 0
     again = np.rint(255 * read_image(tmp_path / "again.png"))
     assert difference(again, back) < 1.5

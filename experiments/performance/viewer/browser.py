@@ -87,7 +87,7 @@ class Window:
         page.on("pageerror", lambda error: self.console.append(("error", str(error))))
         page.add_init_script(_HOOKS + script)
         self.opened = time.time()
-        page.goto(f"{address}{'&' if '?' in address else '?'}fixedDpr=1")
+        page.goto(address)
 
     @property
     def errors(self) -> list[str]:

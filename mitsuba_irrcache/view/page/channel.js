@@ -1,6 +1,15 @@
 // The connection of the components on this page to the viewer; see view/channel.py.
 "use strict";
 
+// Viser lowers its resolution where frames are slow, and images at rest stayed coarse.
+{
+  const address = new URL(window.location.href);
+  if (!address.searchParams.has("fixedDpr")) {
+    address.searchParams.set("fixedDpr", String(Math.min(window.devicePixelRatio || 1, 2)));
+    window.history.replaceState(null, "", address);
+  }
+}
+
 const irrcache = (() => {
   const receivers = new Map(), newest = new Map();
   let socket = null, key = null, closed = false;

@@ -7,12 +7,18 @@
   class Light extends HTMLElement {
     connectedCallback() {
       this.innerHTML = `<canvas role="img" aria-label="direction to the sun, drag to change it"></canvas>
-        <span class="irrcache-quiet">drag the sun over the sphere;
-        with Shift: behind it (dashed)</span>`;
+        <span><span class="irrcache-quiet" title="a new direction switches the sun on">drag;
+        Shift: behind (dashed)</span>
+        <span class="irrcache-row"><label title="azimuth, about the upward axis">azim. °<input
+          type="number" step="1" min="-360" max="360" data-id="azimuth"></label><label
+          title="elevation above the horizon">elev. °<input type="number" step="1" min="-90"
+          max="90" data-id="elevation"></label></span></span>`;
+      this.fields = [...this.querySelectorAll("input")];
+      for (const field of this.fields) field.addEventListener("change", () => this.enter());
       this.canvas = this.querySelector("canvas");
       this.edited = irrcache.throttled("sun");
       this.stops = [
-        irrcache.receive("lighting", (value) => { this.lighting = value; this.draw(); }),
+        irrcache.receive("lighting", (value) => { this.lighting = value; this.fill(); this.draw(); }),
         irrcache.receive("camera", (value) => { this.axes = value; this.draw(); }),
       ];
       this.canvas.addEventListener("pointerdown", (event) => {
@@ -28,6 +34,23 @@
     }
 
     disconnectedCallback() { this.stops.forEach((stop) => stop()); }
+
+    /** Show the angles in their fields, unless the user is typing into them. */
+    fill() {
+      for (const field of this.fields) {
+        if (field !== document.activeElement) field.value = Math.round(this.lighting[field.dataset.id]);
+      }
+    }
+
+    /** Send the angles in the fields, if both are allowed. */
+    enter() {
+      if (this.fields.some((field) => field.value === "" || !field.checkValidity())) {
+        for (const field of this.fields) field.reportValidity();
+        return;
+      }
+      const [azimuth, elevation] = this.fields.map((field) => Number(field.value));
+      irrcache.send("angles", { azimuth, elevation });
+    }
 
     /** Set the direction under the pointer: on the half towards the camera, or behind it. */
     move(event) {

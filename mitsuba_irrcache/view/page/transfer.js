@@ -9,6 +9,9 @@
 (() => {
   const TOP = 6, PLOT = 108, BAND = 16, AXIS = 16, SIDE = 8;
   const HEIGHT = TOP + PLOT + BAND + 12 + AXIS, HIGHEST = 0.999;
+  // The axis of opacities is their cube root: those of tissues lie between 0.001 and 0.1.
+  const ROOT = 3, LINES = [0.01, 0.1, 0.5];
+  const HELP = "click: add a point; drag: move it; wheel: zoom";
   const clamp = (v, low, high) => Math.min(Math.max(v, low), high);
   const hex = (c) => `#${c.map((v) => Math.round(255 * v).toString(16).padStart(2, "0")).join("")}`;
   const rgb = (text) => [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16) / 255);
@@ -41,7 +44,7 @@
           <button data-id="load" title="a transfer function as JSON, from a file">load</button>
           <button data-id="save" title="JSON, for irrcache import">save</button>
         </div>
-        <div class="irrcache-quiet" data-id="pointed">click: add a point; drag: move it; wheel: zoom</div>`;
+        <div class="irrcache-quiet" data-id="pointed"></div>`;
       this.canvas = this.querySelector("canvas");
       this.find = (name) => this.querySelector(`[data-id="${name}"]`);
       this.selected = { curve: "opacity", index: 0 };
@@ -72,12 +75,12 @@
       const [low, high] = this.range;
       return SIDE + ((value - low) / (high - low)) * (this.width - 2 * SIDE);
     }
-    y(opacity) { return TOP + (1 - opacity) * PLOT; }
+    y(opacity) { return TOP + (1 - opacity ** (1 / ROOT)) * PLOT; }
     value(x) {
       const [low, high] = this.range;
       return low + ((x - SIDE) / (this.width - 2 * SIDE)) * (high - low);
     }
-    opacity(y) { return clamp(1 - (y - TOP) / PLOT, 0, HIGHEST); }
+    opacity(y) { return Math.min(clamp(1 - (y - TOP) / PLOT, 0, 1) ** ROOT, HIGHEST); }
 
     /** Return what lies under the pointer: a curve, and the index of its point or -1. */
     hit(event) {
@@ -124,8 +127,8 @@
         context.fillRect(left, TOP + (1 - height) * PLOT, right - left + 0.5, height * PLOT);
       });
       context.strokeStyle = "#ffffff1c";
-      for (const share of [0.25, 0.5, 0.75]) {
-        context.strokeRect(SIDE, this.y(share), this.width - 2 * SIDE, 0);
+      for (const opacity of LINES) {
+        context.strokeRect(SIDE, this.y(opacity), this.width - 2 * SIDE, 0);
       }
     }
 
@@ -143,9 +146,13 @@
       context.rect(SIDE - 6, 0, this.width - 2 * SIDE + 12, HEIGHT);
       context.clip();
       context.beginPath();
-      context.moveTo(-10, this.y(points[0][1]));
-      for (const [value, opacity] of points) context.lineTo(this.x(value), this.y(opacity));
-      context.lineTo(this.width + 10, this.y(points[points.length - 1][1]));
+      context.moveTo(-10, this.y(interpolate(points, this.value(-10))));
+      // Opacities are linear in the values, so that lines are curved on this axis.
+      const inside = points.map(([value]) => this.x(value)).filter((x) => x > 0 && x < this.width);
+      const places = [...Array(Math.ceil(this.width / 2)).keys()].map((n) => 2 * n).concat(inside);
+      for (const x of places.sort((a, b) => a - b)) {
+        context.lineTo(x, this.y(interpolate(points, this.value(x))));
+      }
       context.strokeStyle = "#ffb14e";
       context.lineWidth = 2;
       context.stroke();
@@ -191,6 +198,9 @@
         context.fillText(text, x, HEIGHT - 3);
         context.fillRect(this.x(value), TOP + PLOT, 1, 3);
       }
+      for (const opacity of LINES) {
+        context.fillText(String(opacity), SIDE + 2, this.y(opacity) - 2);
+      }
     }
 
     // ------------------------------------------------------------------ changes
@@ -205,11 +215,12 @@
       this.find("colour-label").hidden = opacity;
       this.find("unit").textContent = this.state.unit ? `value, ${this.state.unit}` : "value";
       this.fill("value", +value.toPrecision(6));
-      if (opacity) this.fill("opacity", +height.toFixed(4));
+      if (opacity) this.fill("opacity", +height.toPrecision(3));
       else this.fill("colour", hex(height));
       this.find("remove").disabled = points.length <= 2;
       this.find("undo").disabled = !this.state.undo;
       this.find("redo").disabled = !this.state.redo;
+      this.point();
       this.draw();
     }
 
@@ -278,6 +289,10 @@
       canvas.addEventListener("pointermove", (event) => this.drags(event));
       canvas.addEventListener("pointerup", (event) => this.release(event));
       canvas.addEventListener("pointercancel", () => (this.drag = null));
+      canvas.addEventListener("pointerleave", () => {
+        this.pointer = undefined;
+        this.point();
+      });
       canvas.addEventListener("contextmenu", (event) => this.menu(event));
       canvas.addEventListener("dblclick", (event) => this.twice(event));
       this.addEventListener("keydown", (event) => this.key(event));
@@ -331,8 +346,8 @@
     drags(event) {
       if (!this.points) return;
       const value = this.value(event.offsetX);
-      this.find("pointed").textContent = `${+value.toPrecision(4)} ${this.state.unit}, ` +
-        `opacity ${interpolate(this.points.opacity, value).toFixed(3)}`;
+      this.pointer = event.offsetX;
+      this.point();
       const drag = this.drag;
       if (!drag) {
         this.canvas.style.cursor = this.hit(event).index >= 0 ? "grab" : "crosshair";
@@ -348,6 +363,17 @@
         const shift = ((event.offsetX - drag.x) / (this.width - 2 * SIDE)) * width;
         this.show(drag.range[0] - shift, width);
       }
+    }
+
+    /** Write the value under the pointer and its opacity below the plot, or else what the mouse does. */
+    point() {
+      let text = HELP;
+      if (this.pointer !== undefined) {
+        const value = this.value(this.pointer);
+        const opacity = interpolate(this.points.opacity, value);
+        text = `${+value.toPrecision(4)} ${this.state.unit}, opacity ${+opacity.toPrecision(2)}`;
+      }
+      this.find("pointed").textContent = text;
     }
 
     release(event) {
@@ -379,19 +405,14 @@
     }
 
     key(event) {
-      if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
-        irrcache.send(event.shiftKey ? "redo" : "undo", null);
-        event.preventDefault();
-        return;
-      }
       if (event.target !== this.canvas) return;
       const [value, height] = this.points[this.selected.curve][this.selected.index];
       const step = (this.range[1] - this.range[0]) / 200, opacity = this.selected.curve === "opacity";
-      const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, 0.01], ArrowDown: [0, -0.01] };
+      const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
       if (event.key === "Delete" || event.key === "Backspace") this.remove();
       else if (event.key in moves) {
         const [along, up] = moves[event.key];
-        this.move(value + along, opacity ? clamp(height + up, 0, HIGHEST) : height, true);
+        this.move(value + along, opacity ? this.opacity(this.y(height) + up) : height, true);
       } else return;
       event.preventDefault();
       event.stopPropagation();
@@ -399,4 +420,17 @@
   }
 
   customElements.define("irrcache-transfer", Transfer);
+
+  // Keys with Ctrl or Alt are no movements of viser's camera, whose handler follows this one.
+  document.addEventListener("keydown", (event) => {
+    if (!(event.ctrlKey || event.metaKey || event.altKey)) return;
+    event.stopImmediatePropagation();
+    const editor = document.querySelector("irrcache-transfer"), target = event.target;
+    const key = event.key.toLowerCase(), types = target.matches("input, textarea");
+    if (key === "a" && !types) event.preventDefault(); // would mark all labels
+    if (key !== "z" || event.altKey || !editor) return;
+    if (types && !editor.contains(target)) return; // undoes typing
+    irrcache.send(event.shiftKey ? "redo" : "undo", null);
+    event.preventDefault();
+  });
 })();

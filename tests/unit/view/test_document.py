@@ -12,7 +12,7 @@ import pytest
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.scene_files import scene_of_text, scene_text
 from mitsuba_irrcache.view.camera import Camera
-from mitsuba_irrcache.view.document import Document, Lighting
+from mitsuba_irrcache.view.document import Document, Lighting, sensor_of
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -159,14 +159,15 @@ def test_saved_scenes_load_from_another_folder(path, tmp_path_factory):
     camera = Camera((1, -4, 2), (0, 0, 0), (0, 0, 1), 25)
     saved = folder / "view.xml"
     properties = {"cache_spp": ("integer", "64")}
-    assert document.save(saved, camera, (30, 20), True, properties, "seen") == [saved]
+    sensor = sensor_of(camera, (30, 20))
+    assert document.save(saved, sensor, True, properties, "seen") == [saved]
     scene = mi.load_file(str(saved))
     assert scene.integrator().cache_spp == 64
     (only,) = scene.sensors()
     assert tuple(only.film().size()) == (30, 20) and only.get_medium() is not None
     volume = np.full((3, 3, 3), 0.5, np.float32)
     document.set_volumes({"density.vol": volume})
-    files = document.save(saved, camera, (30, 20), False, {}, "seen")
+    files = document.save(saved, sensor_of(camera, (30, 20)), False, {}, "seen")
     assert sorted(f.name for f in files) == ["view.density.vol", "view.xml"]
     params = mi.traverse(mi.load_file(str(saved)))
     (data,) = (params[k] for k in params.keys() if k.endswith("sigma_t.data"))

@@ -15,9 +15,9 @@ import pytest
 
 from mitsuba_irrcache.view import comparison
 from mitsuba_irrcache.view.camera import Camera
-from mitsuba_irrcache.view.document import Document
+from mitsuba_irrcache.view.document import Document, sensor_of
 from mitsuba_irrcache.view.light import Light
-from mitsuba_irrcache.view.reference import ViewReference
+from mitsuba_irrcache.view.reference import ViewReference, between
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
 from tests.support.viewer_session import SCENE, SIZE, Screen, drag, front
@@ -41,6 +41,10 @@ def document(request, tmp_path, scenes) -> Document:
     mi.VolumeGrid(density).write(str(tmp_path / "density.vol"))
     (tmp_path / "scene.xml").write_text(SCENES[getattr(request, "param", "cloud")])
     return Document.load(tmp_path / "scene.xml")
+
+
+def front_camera() -> Camera:
+    return Camera((0.5, -5.0, 1.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
 
 
 def reference_of(document: Document, camera: Camera, samples: int) -> ViewReference:
@@ -70,7 +74,7 @@ def test_reference_equals_volpath_of_the_saved_scene(document, tmp_path, positio
     camera = Camera(position, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
     inside = position[1] > -1
     saved = tmp_path / "saved.xml"
-    document.save(saved, camera, SIZE, inside, {}, "")
+    document.save(saved, sensor_of(camera, SIZE), inside, {}, "")
     scene = mi.load_file(str(saved))
     stock = mi.load_dict({"type": "volpath", "max_depth": document.settings.max_depth})
     several = [
@@ -89,17 +93,50 @@ def test_reported_error_excludes_the_reference_noise(document):
 
     An image with a known error is compared with few samples.
     """
-    camera = Camera((0.5, -5.0, 1.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
+    camera = front_camera()
     exact = reference_of(document, camera, 96).radiance()
     few = ViewReference(Light(document.scene(), document.settings, document.seeing), camera, SIZE)
     assert few.error_of(exact) is None
     while few.samples < 2:
         few.refine()
     off = 0.1 * exact.mean() * (-1) ** np.indices(exact.shape[:2]).sum(axis=0)[..., None]
-    error, resolved = few.error_of(exact + off)
+    low, high = few.error_of(exact + off)
     noise = np.sqrt(((few.radiance() - exact) ** 2).mean()) / exact.mean()
-    assert error == pytest.approx(0.1, abs=0.02)
-    assert resolved < 0.5 * noise
+    assert 0.06 < low < 0.1 < high < 0.14
+    assert few.error_of(exact)[1] < 0.6 * noise
+
+
+@pytest.mark.parametrize("true", [0.0, 0.3])
+def test_noise_is_not_reported_as_an_error(document, true):
+    """Bounds of the error hold for noise of few bright paths, whose channels are alike.
+
+    They are two standard errors wide: one trial in forty may exceed each of them.
+    """
+    camera, rng = front_camera(), np.random.default_rng(1)
+    few = ViewReference(Light(document.scene(), document.settings, document.seeing), camera, SIZE)
+    few._passes, few._counts[:] = 2, 1
+    image = np.ones((*few.size[::-1], 3)) + true * rng.choice([-1, 1], (*few.size[::-1], 1))
+    found = []
+    for _ in range(200):
+        alike = (*few._sums.shape[:2], 1)
+        few._sums[:] = rng.exponential(5, alike) * (rng.random(alike) < 0.2)
+        found.append(few.error_of(image))
+    low, high = np.array(found).T
+    assert np.mean(low > true) < 0.05 and np.mean(high < true) < 0.05
+    assert np.mean(high < 2 * low) < 0.05 or true
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "text"),
+    [
+        (0.0, 0.213, "below 21 %"),
+        (0.01, 0.03, "below 3 %"),
+        (0.0118, 0.0126, "1.22 ± 0.04 %"),
+        (0.12, 0.2, "16 ± 4 %"),
+    ],
+)
+def test_errors_are_described_with_their_uncertainty(low, high, text):
+    assert between(low, high) == text
 
 
 def test_reference_is_displayed_until_something_changes(document, monkeypatch):
@@ -144,15 +181,14 @@ def test_reference_is_displayed_until_something_changes(document, monkeypatch):
 
 def test_coarse_references_are_means_over_pixels(document):
     """A coarse reference is the finer one, averaged over the pixels that it covers."""
-    camera = Camera((0.5, -5.0, 1.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
+    camera = front_camera()
     light = Light(document.scene(), document.settings, document.seeing)
     fine, coarse = ViewReference(light, camera, SIZE), ViewReference(light, camera, SIZE, 3)
     for reference, samples in ((fine, 24), (coarse, 96)):
         while reference.samples < samples:
             reference.refine()
     assert coarse.size == (SIZE[0] // 3, SIZE[1] // 3)
-    error, resolved = coarse.error_of(fine.radiance())
-    assert error < max(0.03, 2 * resolved)
+    assert coarse.error_of(fine.radiance())[0] < 0.03
     assert abs(coarse.signed_error(1.1 * fine.radiance()).mean() - 0.1) < 0.02
     # What is left between two means of the same is their noise.
     spread = coarse.signed_error(fine.radiance()).std()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 import weakref
 from dataclasses import replace
@@ -21,7 +22,7 @@ from mitsuba_irrcache.view import window as windows
 from mitsuba_irrcache.view.appearance import Appearance
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document
-from mitsuba_irrcache.view.keep import keep
+from mitsuba_irrcache.view.keep import keep, render_command
 from mitsuba_irrcache.view.picture import KINDS, Look, Samples
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
@@ -56,20 +57,28 @@ def final(picture: Picture) -> bool:
     return picture.final
 
 
-def test_a_window_at_rest_gets_the_image_that_render_gives(session, path, tmp_path):
-    """A window at rest displays the image of ``irrcache render``, and saves files that reproduce
-    it.
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.8, 0.6)])
+def test_a_window_at_rest_gets_the_image_that_render_gives(session, tmp_path, background):
+    """A window at rest displays the image of the command that is shown when it is saved.
+
+    The command replaces no file of the view.
     """
     screen = Screen()
     window = session.open(screen.show)
-    view = View(turned(front(session), 40), SIZE)
+    hidden = any(background)
+    session.edit(lambda document: document.set_hide_emitters(hidden))
+    look = Look(exposure=0.5, tone="filmic", background=background)
+    view = View(turned(front(session), 40), SIZE, look)
     session.look(window, view)
     shown = screen.wait(final).pixels
     files = keep(session, view, tmp_path, "kept", with_cache=True)
-    assert {f.name for f in files} == {"kept.exr", "kept.png", "kept.xml", "kept.cache"}
+    assert {f.name for f in files} == {"kept.exr", "kept.png", "kept-scene.xml", "kept.cache"}
     np.testing.assert_array_equal(np.rint(255 * read_image(tmp_path / "kept.png")), shown)
-    assert main(["render", str(tmp_path / "kept.xml"), "-o", str(tmp_path / "again.exr")]) == 0
-    again = np.rint(255 * read_image(tmp_path / "again.png"))
+    _, *words = shlex.split(render_command("kept", look))
+    words[1] = str(tmp_path / words[1])
+    assert main(words) == 0
+    again = np.rint(255 * read_image(tmp_path / "kept-scene.png"))
+    assert not hidden or shown[0, 0].tolist() == [255, 231, 203]
     difference = np.abs(again - shown.astype(float))
     assert shown.std() > 20
     assert difference.mean() < 0.6 and difference.max() < 12
