@@ -18,7 +18,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core import properties
 from mitsuba_irrcache.core.cancellation import StopCondition
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
+from mitsuba_irrcache.gradients.parameters import enabled
 from mitsuba_irrcache.imaging.camera_source import CameraRaySource
 from mitsuba_irrcache.imaging.image import ImageRenderer
 from mitsuba_irrcache.imaging.options import Options
@@ -224,13 +224,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     such a sharp forward peak is then treated as unscattered (delta-M), also in ``transmittance``
     and alpha.
 
-    Gradients (``dr.backward``) are computed by ``sigma_t`` and ``albedo`` of a medium, by ``g`` of
-    its phase function ``hg``, and by the radiance of emitters, by solving the adjoint transport
-    equation: for one medium in a box or sphere under distant and point emitters (not inside of it
-    if delta-M applies), without surfaces, with the solver ``sweep``, ``max_depth`` 1, 2 or -1, no
-    filter and no ``aovs``. Emissive media have gradients by ``emission`` only. All other gradients,
-    and forward mode, are refused with an error that names the parameter. While parameters carry
-    gradients, the grid of the cache is kept. Images of the same state of the scene in one loss
+    Gradients (``dr.backward``, ``dr.forward``) are computed by ``sigma_t`` and ``albedo`` of a
+    medium, by ``g`` of its phase function ``hg``, and by the radiance of emitters, by solving the
+    adjoint transport equation: for one medium in a box or sphere under distant and point emitters
+    (not inside of it if delta-M applies), without surfaces, with the solver ``sweep``,
+    ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. Emissive media have gradients by ``emission`` only. All other gradients
+    are refused with an error that names the parameter. While parameters carry gradients, the grid
+    of the cache is kept. Images of the same state of the scene in one loss
     share one adjoint solve; ``cache_spp`` also sets its directions.
 
     .. tabs::
@@ -463,8 +463,14 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         seed: int = 0,
         spp: int = 0,
     ) -> mi.TensorXf:
-        """Refuse: gradients are computed in reverse mode only."""
-        refuse_all(enabled(params), "dr.forward was called", "Call dr.backward on a loss")
+        """Return the derivative of the image along the derivatives of the parameters."""
+        from mitsuba_irrcache.gradients.operations import SceneState
+
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        if not enabled(params):
+            return dr.zeros(mi.TensorXf, self.render(scene, sensor, seed, 1).shape)
+        return SceneState(self, scene, params, alone=True).image_along(sensor, seed, spp)
 
     def render_backward(
         self,

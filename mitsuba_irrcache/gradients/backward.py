@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.core.spectrum import interleaved
+from mitsuba_irrcache.gradients.emitter_tangents import EmitterTangents
 from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
 from mitsuba_irrcache.gradients.film import LUMINANCE, FilmAdjoint
 from mitsuba_irrcache.gradients.medium import MediumAdjoint, field_of, original_of
@@ -19,6 +22,7 @@ from mitsuba_irrcache.gradients.parameters import (
     roles_of,
     shaped_like,
 )
+from mitsuba_irrcache.gradients.tangent import ImageTangent, changed_field
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, position_of
 from mitsuba_irrcache.lights.falloff import edges_away
@@ -108,6 +112,7 @@ class ParameterAdjoint:
         self._camera_rays, self._step, emission = image
         (medium,) = media_of(scene)
         roles = roles_of(params, keys, medium, scene, emission)
+        self._keys, self._roles = keys, roles
         self._of_medium = {k: role for k, role in roles.items() if not isinstance(role, mi.Emitter)}
         _check_emission(part, self._of_medium)
         emitters = [role for role in roles.values() if isinstance(role, mi.Emitter)]
@@ -129,8 +134,25 @@ class ParameterAdjoint:
         """
         return self._by_parameters(self._adjoint.transported(fluence))
 
+    def along(self, changes: Mapping[str, object]) -> ImageTangent:
+        """Return the derivatives of images along ``changes`` of the parameters, by key."""
+        medium, fields, g, by_emitter = self._new_medium(channels_apart=True), {}, 0.0, {}
+        for key in self._keys:
+            change, value = changes[key], self._params[key]
+            role = self._roles[key]
+            if isinstance(role, mi.Emitter):
+                by_emitter[role] = change, value, key
+            elif role == MEAN_COSINE:
+                g = float(np.array(change).ravel()[0])
+            else:
+                fields[role] = changed_field(value, change, medium, role)
+        return ImageTangent(medium, fields, g, EmitterTangents(self._scene, by_emitter))
+
     @cached_property
     def _adjoint(self) -> MediumAdjoint:
+        return self._new_medium()
+
+    def _new_medium(self, channels_apart: bool = False) -> MediumAdjoint:
         wanted: dict[str, int] = {}
         for key, role in self._of_medium.items():
             if role == MEAN_COSINE:
@@ -140,7 +162,8 @@ class ParameterAdjoint:
             own = field.channels if field.grid is not None else channels_of(self._params[key])
             wanted[role] = max(wanted.get(role, 1), own)
         march = self._camera_rays, self._step
-        return MediumAdjoint(self._scene, self._part, march, wanted, self._emitters, self._seed)
+        of = self._emitters, self._seed, channels_apart
+        return MediumAdjoint(self._scene, self._part, march, wanted, *of)
 
     def _by_parameters(self, found: dict[str, mi.Float]) -> dict[str, object]:
         result = {}

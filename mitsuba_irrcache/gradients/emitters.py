@@ -64,7 +64,7 @@ class EmitterAdjoint:
                 _add_sun(sun, rows.mean(axis=0))
         if self._environment is not None:
             both = np.stack([directions[:end], -directions[:end]], axis=1).reshape(-1, 3)
-            angle = _solid_angles(self._environment, both, incoming[:end])
+            angle = solid_angles(self._environment, both, incoming[:end])
             towards = mi.Vector3f(both.T.astype(np.float32))
             adjoint = (derivatives[:end] * angle).reshape(len(both), -1)
             self._add_environment(towards, mi.Spectrum(adjoint.T.astype(np.float32)))
@@ -134,7 +134,7 @@ def _transmitted_importance(
     return [result * volume_of(transport.grid) for result in found]
 
 
-def _solid_angles(environment: mi.Emitter, both: np.ndarray, incoming: np.ndarray) -> np.ndarray:
+def solid_angles(environment: mi.Emitter, both: np.ndarray, incoming: np.ndarray) -> np.ndarray:
     """Return the solid angles that weight the radiance along each ordinate and its opposite."""
     radiance = environment_radiance(environment, both).reshape(-1, 2, incoming.shape[-1])
     is_lit = radiance > 0

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.render.film import PixelPositions, SampledFilm, camera_ray
 from mitsuba_irrcache.render.pixel_filter import reconstructed
@@ -31,21 +32,84 @@ class CameraPass:
     alpha: mi.Float | None
 
 
-class FilmAdjoint:
-    """Distribute derivatives ``grad`` (height, width, channels) of an objective with respect to the
-    pixels of an image of ``sensor`` to its camera samples.
-    """
+class SampledCamera:
+    """The camera samples of an image of ``sensor``, ``spp`` in each pixel (0: of its sampler)."""
 
-    def __init__(self, sensor: mi.Sensor, grad: mi.TensorXf, seed: int, spp: int) -> None:
+    def __init__(self, sensor: mi.Sensor, seed: int, spp: int) -> None:
         self._sensor, self._film = sensor, sensor.film()
         self._seed, self._spp = seed, spp or sensor.sampler().sample_count()
         self._frame = SampledFilm(self._film, self._spp, LANES)
-        self.colour, self.alpha = _planes(self._film, grad)
         #: medium around the sensor
         self.medium = sensor.get_medium()
         #: numbers of pixels, with those beside the image, and of camera samples
         self.pixels = self._frame.pixels
         self.samples = self.pixels * self._spp
+
+    def _drawn(self) -> Iterator[tuple]:
+        """Yield positions on the film, pixels, and rays of the camera samples of each launch."""
+        sampler, frame = self._sensor.sampler().clone(), self._frame
+        sampler.set_sample_count(self._spp)
+        sampler.set_samples_per_wavefront(frame.per_pass)
+        sampler.seed(self._seed, frame.lanes)
+        spread = PixelPositions(sampler, self._seed, self._spp)
+        for done in range(0, self._spp, frame.per_pass):
+            spread.first = dr.opaque(mi.UInt32, done)
+            position, index, _ = frame.positions(spread)
+            ray, weight = camera_ray(self._sensor, sampler, position)
+            yield position, index, sampler, ray, weight
+            sampler.advance()
+            sampler.schedule_state()
+            dr.eval()
+
+
+class FilmTangent(SampledCamera):
+    """Reconstruct the derivative of an image from those of the radiance of its camera samples."""
+
+    def __init__(self, sensor: mi.Sensor, seed: int, spp: int) -> None:
+        super().__init__(sensor, seed, spp)
+        self.has_alpha = mi.has_flag(self._film.flags(), mi.FilmFlags.Alpha)
+        self._sums: list[mi.Float] | None = None
+
+    def passes(self) -> Iterator[tuple[CameraPass, mi.Point2f]]:
+        """Yield the camera samples of each launch, with the weights of the sensor in place of
+        derivatives, and their positions on the film.
+        """
+        for position, _, sampler, ray, weight in self._drawn():
+            yield CameraPass(sampler, mi.Ray3f(ray), mi.Spectrum(weight), None), position
+
+    def add(self, position: mi.Point2f, radiance: mi.Spectrum, alpha: mi.Float) -> None:
+        """Add the derivatives of the radiance and alpha of the samples of a launch."""
+        values = [*radiance, *([alpha] if self.has_alpha else [])]
+        frame = self._frame
+        found = reconstructed(self._film, frame.border, frame.per_pass, position, values)
+        if self._sums is not None:
+            found = [a + b for a, b in zip(self._sums, found, strict=True)]
+        dr.eval(found)
+        self._sums = found
+
+    def image(self) -> mi.TensorXf:
+        """Return the derivative of the image."""
+        *planes, weights = self._sums
+        planes = [dr.select(weights != 0, plane / weights, 0) for plane in planes]
+        alpha = [planes.pop()] if self.has_alpha else []
+        self._film.prepare([])
+        shape = self._film.develop().shape
+        colours = shape[2] - len(alpha)
+        if mi.is_monochromatic:
+            planes = planes * colours
+        elif colours == 1:
+            planes = [sum(s * plane for s, plane in zip(LUMINANCE, planes, strict=True))]
+        return mi.TensorXf(interleaved(planes + alpha, shape[0] * shape[1]), shape)
+
+
+class FilmAdjoint(SampledCamera):
+    """Distribute derivatives ``grad`` (height, width, channels) of an objective with respect to the
+    pixels of an image of ``sensor`` to its camera samples.
+    """
+
+    def __init__(self, sensor: mi.Sensor, grad: mi.TensorXf, seed: int, spp: int) -> None:
+        super().__init__(sensor, seed, spp)
+        self.colour, self.alpha = _planes(self._film, grad)
 
     @property
     def largest(self) -> float:
@@ -72,22 +136,6 @@ class FilmAdjoint:
             else:
                 radiance = mi.Spectrum(colour) * weight
             yield CameraPass(sampler, mi.Ray3f(ray), radiance, alpha)
-
-    def _drawn(self) -> Iterator[tuple]:
-        """Yield positions on the film, pixels, and rays of the camera samples of each launch."""
-        sampler, frame = self._sensor.sampler().clone(), self._frame
-        sampler.set_sample_count(self._spp)
-        sampler.set_samples_per_wavefront(frame.per_pass)
-        sampler.seed(self._seed, frame.lanes)
-        spread = PixelPositions(sampler, self._seed, self._spp)
-        for done in range(0, self._spp, frame.per_pass):
-            spread.first = dr.opaque(mi.UInt32, done)
-            position, index, _ = frame.positions(spread)
-            ray, weight = camera_ray(self._sensor, sampler, position)
-            yield position, index, sampler, ray, weight
-            sampler.advance()
-            sampler.schedule_state()
-            dr.eval()
 
     def _of_samples(
         self, position: mi.Point2f, index: mi.UInt32, norm: mi.Float | None

@@ -10,9 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.gradients.parameters import ALBEDO, MEAN_COSINE, SIGMA_T
 from mitsuba_irrcache.gradients.splatting import GridSplat
-from mitsuba_irrcache.grids.fields import Field
+from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 
@@ -69,6 +70,39 @@ def with_forward_peak(
         result[MEAN_COSINE] = found[MEAN_COSINE] + mi.Float(change * by_share)
     dr.eval(result)
     return result
+
+
+def changes_without_peak(
+    medium: MediumGrid, sigma_t: Field | None, albedo: Field | None, share: float
+) -> tuple[Field, Field]:
+    """Return the changes of the extinction and albedo of ``medium``, which is scaled.
+
+    Args:
+        medium: the scaled medium.
+        sigma_t: change of the extinction of ``medium.original``; None for 0.
+        albedo: change of its albedo.
+        share: change of the share of the forward peak.
+    """
+    # docs/primer, eq. (8.14), transposed
+    original, peak = medium.original, medium.phase.forward
+
+    def at(p: mi.Point3f) -> tuple:
+        fields = original.sigma_t, original.albedo, sigma_t, albedo
+        return tuple(mi.Spectrum(0 if f is None else f.at_world(p)) for f in fields)
+
+    s, a, ds, da = at(_positions(medium.sigma_t.grid))
+    extinction = _field(medium.sigma_t, (1 - peak * a) * ds - s * (peak * da + a * share))
+    s, a, ds, da = at(_positions(medium.albedo.grid))
+    change = (da * (1 - peak) + share * a * (a - 1)) / dr.square(1 - peak * a)
+    return extinction, _field(medium.albedo, change)
+
+
+def _field(like: Field, values: mi.Spectrum) -> Field:
+    """Return a field of ``values`` on the grid of another one."""
+    channels = dr.size_v(mi.Spectrum)
+    if like.grid is None:
+        return ConstantField(np.array(values, dtype=np.float64).reshape(channels, -1)[:, 0])
+    return GridField(like.grid, interleaved(values, like.grid.voxel_count), channels)
 
 
 def _positions(grid: Grid | None) -> mi.Point3f:

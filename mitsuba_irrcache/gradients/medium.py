@@ -71,6 +71,7 @@ class MediumAdjoint:
             `EMISSION` or `MEAN_COSINE`.
         emitters: receives the derivatives with respect to the radiance of emitters.
         seed: determines the ordinates.
+        channels_apart: whether a single channel may not represent all.
     """
 
     def __init__(
@@ -81,38 +82,39 @@ class MediumAdjoint:
         wanted: dict[str, int],
         emitters: EmitterAdjoint,
         seed: int,
+        channels_apart: bool = False,
     ) -> None:
         self._scene, self._part, self._wanted = scene, part, wanted
         self._camera_rays, step = image
-        self._medium, self._emitters = part.medium, emitters
-        self._transport: AdjointTransport | None = None
+        self.medium, self._emitters = part.medium, emitters
+        self.transport: AdjointTransport | None = None
         #: number of channels of the sums for each role, see `_sums_for`
         self._sums = self._sums_for(wanted)
-        self._fluence: FluenceFields | None = None
+        self.fluence: FluenceFields | None = None
         #: for derivatives with respect to the mean cosine
-        self._phases: NeighbouringPhases | None = None
+        self.phases: NeighbouringPhases | None = None
         colour = None
         if part.cache is not None:
             self.grid = part.cache.grid
             self._check_memory()
-            self._transport = self._new_transport(seed)
-            self._phases = self._transport.neighbours
-            self._fluence = FluenceFields(scene, self._medium, part.cache, self._transport)
-            self._quadrature = VoxelQuadrature(self._medium, self.grid)
-            self._extinction = list(self._quadrature.extinction())
-            dr.eval(self._extinction)
-            if self._transport.channels == 1:
-                factors = [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
+            self.transport = self._new_transport(seed, channels_apart)
+            self.phases = self.transport.neighbours
+            self.fluence = FluenceFields(scene, self.medium, part.cache, self.transport)
+            self.quadrature = VoxelQuadrature(self.medium, self.grid)
+            self.extinction = list(self.quadrature.extinction())
+            dr.eval(self.extinction)
+            if self.transport.channels == 1:
+                factors = [dr.opaque(mi.Float, float(c)) for c in self.transport.colour]
                 colour = mi.Spectrum(factors)
         _warn_of_aureole(part)
         neighbours = None
-        if self._phases is not None:
+        if self.phases is not None:
             marches = [
-                CameraReplay(self._medium, self._fluence.scattered_by(phase), colour, step)
-                for phase in (self._phases.below, self._phases.above)
+                CameraReplay(self.medium, self.fluence.scattered_by(phase), colour, step)
+                for phase in (self.phases.below, self.phases.above)
             ]
-            neighbours = (*marches, self._phases.step)
-        self._march = CameraReplay(self._medium, self._fluence, colour, step, neighbours)
+            neighbours = (*marches, self.phases.step)
+        self.march = CameraReplay(self.medium, self.fluence, colour, step, neighbours)
 
     def _sums_for(self, wanted: dict[str, int]) -> dict[str, int]:
         """Return the number of channels of the derivatives to sum, by role.
@@ -120,25 +122,25 @@ class MediumAdjoint:
         With delta-M scaling, the ``wanted`` derivative with respect to the albedo follows from
         those with respect to both the scaled extinction and the scaled albedo.
         """
-        if self._medium.original is None or wanted.keys() <= {EMISSION}:
+        if self.medium.original is None or wanted.keys() <= {EMISSION}:
             return dict(wanted)
-        channels = max(self._medium.channels, *wanted.values())
+        channels = max(self.medium.channels, *wanted.values())
         roles = (SIGMA_T, ALBEDO) if wanted.keys() & {ALBEDO, MEAN_COSINE} else (SIGMA_T,)
         return wanted | dict.fromkeys(roles, channels)
 
-    def _new_transport(self, seed: int) -> AdjointTransport:
+    def _new_transport(self, seed: int, channels_apart: bool) -> AdjointTransport:
         settings, wanted = self._part.settings, self._wanted
-        is_grey = self._medium.channels == max(wanted.values(), default=3) == 1
+        is_grey = self.medium.channels == max(wanted.values(), default=3) == 1
         return AdjointTransport(
             self._scene,
-            self._medium,
+            self.medium,
             self.grid,
             self._sums,
             TransportSettings(
                 (settings.seed, seed),
                 self._pairs,
                 single=settings.max_depth == 2,
-                grey=is_grey and not self._emitters and EMISSION not in wanted,
+                grey=is_grey and not (channels_apart or self._emitters or EMISSION in wanted),
             ),
         )
 
@@ -148,10 +150,10 @@ class MediumAdjoint:
         part, environment = self._part, self._scene.environment()
         uneven = environment is not None and kind_of(environment) in UNEVEN
         usual = part.solver.default_samples(
-            self._medium, part.settings.max_depth, part.cache.active_count
+            self.medium, part.settings.max_depth, part.cache.active_count
         )
         share = (part.cache.samples or usual) / usual
-        pairs = SHARP_PAIRS if self._medium.phase.forward else PAIRS
+        pairs = SHARP_PAIRS if self.medium.phase.forward else PAIRS
         return max(FEWEST_PAIRS, round((MOST_PAIRS if uneven else pairs) * share))
 
     def _check_memory(self) -> None:
@@ -175,14 +177,8 @@ class MediumAdjoint:
         """
         splats = None
         for each in film.passes():
-            segments, behind, weights = self._rays(each, film.medium)
-            ahead, transmittance = self._march.radiance(segments)
-            original = transmittance  # that of the medium before delta-M scaling
-            if self._is_scaled:
-                projection = self._camera_rays.projection
-                original = projection.unscattered(
-                    transmittance, each.ray, segments.near, segments.far, segments.active
-                )
+            segments, behind, weights = self.rays(each, film.medium)
+            ahead, transmittance, original = self.marched(segments)
             ahead, unscattered = ahead + transmittance * behind[0], original * behind[1]
             visible = (transmittance * weights[0] + original * weights[1]) * each.radiance
             dr.eval(ahead, visible, unscattered)
@@ -190,7 +186,7 @@ class MediumAdjoint:
                 self._emitters.add_background(each.ray, visible)
             if splats is None:
                 splats = self._camera_splats(dr.abs(ahead) + dr.abs(unscattered), film)
-            self._march.replay(segments, ahead, unscattered, splats)
+            self.march.replay(segments, ahead, unscattered, splats)
             dr.eval()
         found = self._at_data({role: getattr(splats, role).values() for role in self._sums})
         if splats.unscattered is not None:
@@ -199,22 +195,42 @@ class MediumAdjoint:
             return found, None
         return found, self._adjoint_fluence(splats.collisions)
 
+    def marched(self, segments: RaySegments) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
+        """Return the weighted radiance that the medium scatters into rays, and transmittances: that
+        of the medium as it is rendered, and that before delta-M scaling.
+        """
+        ahead, transmittance = self.march.radiance(segments)
+        original = transmittance
+        if self.is_scaled:
+            projection = self._camera_rays.projection
+            original = projection.unscattered(
+                transmittance, segments.ray, segments.near, segments.far, segments.active
+            )
+        return ahead, transmittance, original
+
     @property
-    def _is_scaled(self) -> bool:
+    def shows_environment(self) -> bool:
+        """Whether an environment is visible behind the medium."""
+        rays = self._camera_rays
+        seen = self._scene.environment() is not None and not rays.hide_emitters
+        return seen and rays.shows_emitters
+
+    @property
+    def is_scaled(self) -> bool:
         """Return whether the medium is scaled by delta-M, and scatters."""
-        return self._medium.original is not None and self._fluence is not None
+        return self.medium.original is not None and self.fluence is not None
 
     def _at_data(self, found: dict[str, mi.Float]) -> dict[str, mi.Float]:
         """Convert derivatives with respect to the rendered medium to those of the scene's medium.
 
         These differ by delta-M scaling.
         """
-        if self._medium.original is None or self._sums.keys() <= {EMISSION}:
+        if self.medium.original is None or self._sums.keys() <= {EMISSION}:
             return found
-        change = self._phases.forward if self._phases is not None else 0.0
-        return with_forward_peak(self._medium, found, self._sums[SIGMA_T], self._wanted, change)
+        change = self.phases.forward if self.phases is not None else 0.0
+        return with_forward_peak(self.medium, found, self._sums[SIGMA_T], self._wanted, change)
 
-    def _rays(self, each: CameraPass, medium: mi.Medium | None) -> tuple:
+    def rays(self, each: CameraPass, medium: mi.Medium | None) -> tuple:
         """Return what the march of camera rays starts from.
 
         ``medium`` is the one around the sensor. The results are
@@ -227,10 +243,10 @@ class MediumAdjoint:
         ray, camera_rays = each.ray, self._camera_rays
         visible, background, *weights = camera_rays.background(self._scene, ray, mi.Bool(True))
         behind = [each.radiance * background * weight for weight in weights]
-        if not (visible or self._is_scaled):
+        if not (visible or self.is_scaled):
             weights = [mi.Float(0), mi.Float(0)]
         if each.alpha is not None and not visible:
-            behind[self._is_scaled] -= each.alpha / dr.size_v(mi.Spectrum)
+            behind[self.is_scaled] -= each.alpha / dr.size_v(mi.Spectrum)
         hit, near, far = camera_rays.span(ray, medium)
         offset = 1 - each.sampler.next_1d()
         segments = RaySegments(ray, mi.Float(near), mi.Float(far), each.radiance, offset, hit)
@@ -242,19 +258,19 @@ class MediumAdjoint:
 
         ``ahead`` is the largest weighted radiance of the rays, which bounds the sums.
         """
-        lengths = np.linalg.norm(self._medium.frame[:3, :3], axis=0)
+        lengths = np.linalg.norm(self.medium.frame[:3, :3], axis=0)
         diagonal, rays = float(np.linalg.norm(lengths)), film.samples * MARGIN
         largest = film.largest * film.pixels * MARGIN
-        peak = self._medium.phase.peak
+        peak = self.medium.phase.peak
         brightest = max(float(dr.max(dr.max(dr.abs(ahead)))[0]) * rays, 1e-30)
-        irradiance = self._march.irradiance
+        irradiance = self.march.irradiance
         mean = irradiance.maximum * peak / (4 * np.pi) if irradiance is not None else 0.0
         collisions = unscattered = None
-        if self._transport is not None:
-            components = self._transport.channels * self._transport.scattering.camera_count
+        if self.transport is not None:
+            components = self.transport.channels * self.transport.scattering.camera_count
             collisions = VoxelSums(self.grid, components, largest * peak)
-        if self._is_scaled and SIGMA_T in self._wanted:
-            original, bound = self._medium.original.sigma_t, brightest * diagonal
+        if self.is_scaled and SIGMA_T in self._wanted:
+            original, bound = self.medium.original.sigma_t, brightest * diagonal
             unscattered = splat_of(original, self._wanted[SIGMA_T], bound)
         return CameraSplats(
             self._splat(SIGMA_T, (brightest + largest * mean) * diagonal),
@@ -269,7 +285,7 @@ class MediumAdjoint:
         """Return sums for derivatives with respect to a field; None if they are not wanted."""
         if role not in self._sums:
             return None
-        return splat_of(field_of(self._medium, role), self._sums[role], bound)
+        return splat_of(field_of(self.medium, role), self._sums[role], bound)
 
     # Transport
 
@@ -281,13 +297,13 @@ class MediumAdjoint:
         # docs/primer, eq. (8.4)
         least = dr.opaque(mi.Float, EMPTY / float(self.grid.voxel_size.min()))
         per_volume = dr.opaque(mi.Float, 1 / volume_of(self.grid))
-        values, count = sums.values(), self._transport.scattering.camera_count
+        values, count = sums.values(), self.transport.scattering.camera_count
         found = [
             [
                 dr.select(mean > least, total * per_volume / dr.maximum(mean, least), 0)
                 for total in values[c * count : (c + 1) * count]
             ]
-            for c, mean in zip(range(self._transport.channels), self._extinction, strict=False)
+            for c, mean in zip(range(self.transport.channels), self.extinction, strict=False)
         ]
         dr.eval(found)
         return [concatenated(components) for components in found]
@@ -298,22 +314,22 @@ class MediumAdjoint:
         ``fluence`` is the sum of the arrays that `replayed` returns. The derivatives are flat
         arrays at the voxels of the data, by role.
         """
-        transport = self._transport
+        transport = self.transport
         count = transport.scattering.camera_count
         camera = [split(values, count) for values in fluence[: transport.channels]]
-        found = transport.derivatives(self._fluence.collided, camera, self._extinction)
+        found = transport.derivatives(self.fluence.collided, camera, self.extinction)
         self._emitters.add_transport(transport, found)
         if not self._wanted:
             return {}
-        volume = 3 * MARGIN * abs(np.linalg.det(self._medium.frame[:3, :3]))
+        volume = 3 * MARGIN * abs(np.linalg.det(self.medium.frame[:3, :3]))
         collided = _largest(found.collided)
         splats = {
             SIGMA_T: self._splat(SIGMA_T, volume * (_largest(found.sigma_t) + collided)),
-            ALBEDO: self._splat(ALBEDO, volume * collided * self._medium.sigma_t.maximum),
+            ALBEDO: self._splat(ALBEDO, volume * collided * self.medium.sigma_t.maximum),
             EMISSION: self._splat(EMISSION, volume * _largest(found.emitted)),
         }
         of_medium = splats[SIGMA_T], splats[ALBEDO], found, transport.albedo
-        self._quadrature.add(*of_medium, splats[EMISSION])
+        self.quadrature.add(*of_medium, splats[EMISSION])
         result = {role: splats[role].values() for role in self._sums if role in splats}
         if MEAN_COSINE in self._wanted:
             total = sum(np.array(values, dtype=np.float64).sum() for values in found.g)
@@ -325,7 +341,7 @@ class MediumAdjoint:
 
     def _along_paths_to_light(self, light: int, found: Derivatives) -> mi.Float:
         """Return derivatives through the extinction between a point-like light and the voxels."""
-        grid, transport = self.grid, self._transport
+        grid, transport = self.grid, self.transport
         share = dr.opaque(mi.Float, -volume_of(grid))
         worth = transport.derivative_by_point(light, found)
         removed = transport.from_points[light] * worth * share
@@ -334,7 +350,7 @@ class MediumAdjoint:
         bound = float(dr.max(dr.max(dr.abs(removed)))[0]) * grid.voxel_count * diagonal * 3
         splat, emitter = self._splat(SIGMA_T, bound * MARGIN), transport.point_lights[light]
         add_paths_to_light(
-            self._medium, emitter, transport.positions, removed, self._march.step, splat
+            self.medium, emitter, transport.positions, removed, self.march.step, splat
         )
         return splat.values()
 

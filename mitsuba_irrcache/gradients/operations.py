@@ -18,9 +18,10 @@ import numpy as np
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import graph_variables
 from mitsuba_irrcache.gradients.backward import ParameterAdjoint
-from mitsuba_irrcache.gradients.film import FilmAdjoint
+from mitsuba_irrcache.gradients.film import FilmAdjoint, FilmTangent
 from mitsuba_irrcache.gradients.medium import values_per_voxel
 from mitsuba_irrcache.gradients.parameters import enabled
+from mitsuba_irrcache.gradients.tangent import ImageTangent
 
 
 class DifferentiableIntegrator(Protocol):
@@ -32,9 +33,6 @@ class DifferentiableIntegrator(Protocol):
         self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, develop: bool, evaluate: bool
     ) -> mi.TensorXf:
         """Render an image, as Mitsuba's integrators do."""
-
-    def render_forward(self, scene: mi.Scene, params: mi.SceneParameters) -> mi.TensorXf:
-        """Propagate derivatives in forward mode, as Mitsuba's integrators do."""
 
     def exclusively(self) -> AbstractContextManager:
         """Return a context in which no other thread changes the cache."""
@@ -70,6 +68,8 @@ class SceneState:
         if cache is not None:
             self.voxels = cache.grid.voxel_count * values_per_voxel(cache)
         self._adjoint: ParameterAdjoint | None = None
+        #: state of the cache, derivatives of the parameters, and derivatives of images along them
+        self._tangent: tuple[int, dict, ImageTangent] | None = None
         # Dr.Jit forgets edges of its graph once it has followed them.
         self._is_solved = alone
 
@@ -124,9 +124,23 @@ class SceneState:
             found = adjoint.transport(list(fluence))
         self._accumulate(found)
 
-    def refuse_forward(self) -> None:
-        """Raise the integrator's error that forward mode is not supported."""
-        self.integrator.render_forward(self.scene, self.params)
+    def image_along(self, sensor: mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
+        """Return the derivative of an image along the derivatives of the parameters.
+
+        Images that are differentiated one after the other along the same ones share the solve.
+        """
+        changes = {key: dr.grad(self.params[key]) for key in self._identity}
+        with dr.suspend_grad(), self.integrator.exclusively():
+            revision, tangent = self.integrator.revision(self.scene), None
+            if self._tangent is not None and self._tangent[0] == revision:
+                tangent = self._tangent[2] if _same(self._tangent[1], changes) else None
+            if tangent is None:
+                number = int(np.array(seed).ravel()[0])
+                keys = list(changes)
+                adjoint = self.integrator.adjoint(self.scene, self.params, keys, number)
+                tangent = adjoint.along(changes)
+                self._tangent = revision, changes, tangent
+            return tangent.image(FilmTangent(sensor, seed, spp))
 
     def _accumulate(self, found: dict[str, object]) -> None:
         # Gradients must not be suspended, or nothing is added.
@@ -142,7 +156,8 @@ class Irradiance(dr.CustomOp):
         return dr.zeros(mi.Spectrum, state.voxels)
 
     def forward(self) -> None:
-        self._state.refuse_forward()
+        # Images compute what changes through the irradiance: their state has its derivatives.
+        self.set_grad_out(dr.zeros(mi.Spectrum, self._state.voxels))
 
     def backward(self) -> None:
         self._state.solve(self.grad_out())
@@ -177,7 +192,7 @@ class Image(dr.CustomOp):
             return state.integrator.render(state.scene, sensor, seed[0], spp[0], True, False)
 
     def forward(self) -> None:
-        self._shared.state.refuse_forward()
+        self.set_grad_out(self._shared.state.image_along(self._sensor, self._seed, self._spp))
 
     def backward(self) -> None:
         found = self._shared.state.add_image(self.grad_out(), self._sensor, self._seed, self._spp)
@@ -204,6 +219,11 @@ def image(
             shared = SharedIrradiance(SceneState(integrator, scene, params))
     arguments = dict(params), sensor, seed, spp
     return dr.custom(Image, shared, shared.variable, *arguments), shared
+
+
+def _same(first: dict, second: dict) -> bool:
+    """Return whether two dictionaries have equal arrays."""
+    return all(np.array_equal(np.array(first[key]), np.array(second[key])) for key in second)
 
 
 def _variables(params: mi.SceneParameters) -> dict[str, list[int]]:

@@ -8,6 +8,7 @@ import mitsuba as mi
 from mitsuba_irrcache.core.fast_math import minimum
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, summed_to_channels
+from mitsuba_irrcache.gradients.tangent_fields import FieldReader
 from mitsuba_irrcache.media.medium import MediumGrid
 
 
@@ -18,9 +19,11 @@ def add_paths_to_light(
     position: mi.Point3f,
     removed: mi.Spectrum,
     step: mi.Float,
-    splat: GridSplat | ConstantSplat,
+    splat: GridSplat | ConstantSplat | FieldReader,
 ):
     """Add derivatives with respect to the extinction between positions and a point-like light.
+
+    Returns ``splat``.
 
     Args:
         medium: the medium that the lines to the light cross.
@@ -44,3 +47,4 @@ def add_paths_to_light(
         splat.add(ray(0.5 * (t + end)), summed_to_channels(change, splat.channels), active)
         t = end
         active &= t < far
+    return splat

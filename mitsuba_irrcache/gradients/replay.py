@@ -24,6 +24,7 @@ from mitsuba_irrcache.gradients.splatting import (
     VoxelSums,
     summed_to_channels,
 )
+from mitsuba_irrcache.gradients.tangent_fields import CameraReaders
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -237,9 +238,9 @@ class CameraReplay:
         segments: RaySegments,
         ahead: mi.Spectrum,
         unscattered: mi.Spectrum,
-        splats: CameraSplats,
+        splats: CameraSplats | CameraReaders,
     ):
-        """March the rays again, and add derivatives to ``splats``.
+        """March the rays again, add derivatives to ``splats``, and return these.
 
         Args:
             segments: the rays.
@@ -281,7 +282,7 @@ class CameraReplay:
                 splats.collisions.add(p, values, active)
             if dr.hint(splats.g is not None, mode="scalar"):
                 change = passed * absorbed * albedo * self.by_mean_cosine(p, active, neighbours)
-                splats.g.add(p, summed_to_channels(change, 1), active)
+                splats.g.add(p, summed_to_channels(change, splats.g.channels), active)
             if dr.hint(splats.unscattered is not None, mode="scalar"):
                 change = summed_to_channels(-length * unscattered, splats.unscattered.channels)
                 splats.unscattered.add(p, change, active)
@@ -290,3 +291,4 @@ class CameraReplay:
             t = end
             k += 1
             active &= (t < far) & (dr.max(transmittance) > OPAQUE)
+        return splats

@@ -9,6 +9,7 @@ import numpy as np
 from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, summed_to_channels
 from mitsuba_irrcache.gradients.transport import Derivatives
+from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 
@@ -82,6 +83,48 @@ class VoxelQuadrature:
                 there = inside & medium.emission.covers(p)
                 emission.add(p, summed_to_channels(by_emission, emission.channels), there)
             k += 1
+
+    @symbolic
+    def means(
+        self, sigma_t: Field | None, albedo: Field | None, emission: Field | None, mean: list
+    ):
+        """Return the transpose of `add`: means over the voxels of changes of the data.
+
+        Args:
+            sigma_t: field of the changes of the extinction; None for 0.
+            albedo: field of those of the albedo.
+            emission: field of those of the emission.
+            mean: the albedo of the voxels, by channel.
+
+        Returns the changes of the extinction, of the scattering coefficient beyond those at the
+        albedo of the voxel, and of the emission.
+        """
+        grid, medium = self.grid, self.medium
+        voxel = dr.arange(mi.UInt32, grid.voxel_count)
+        corner, sides = mi.Point3f(*grid.voxel_indices(voxel)), [Divisor(self.points)] * 2
+        count, points = dr.opaque(mi.UInt32, self.points**3), dr.opaque(mi.Float, self.points)
+        share = dr.opaque(mi.Float, 1 / self.points**3)
+        own_mean, k, none = mi.Spectrum(*mean), mi.UInt32(0), dr.zeros(mi.Float, grid.voxel_count)
+        extinction, collided, emitted = mi.Spectrum(none), mi.Spectrum(none), mi.Spectrum(none)
+        while dr.hint(k < count, label="points in a voxel"):
+            place = mi.Point3f(*unravelled(k, sides)) + 0.5
+            p = grid.world.point(corner + place / points)
+            inside = mi.Bool(True)
+            if dr.hint(self.cut, mode="scalar"):
+                inside = medium.contains(p)
+            if dr.hint(sigma_t is not None, mode="scalar"):
+                change = dr.select(inside, mi.Spectrum(sigma_t.at_world(p, inside)) * share, 0)
+                extinction += change
+                collided += change * (mi.Spectrum(medium.albedo.at_world(p, inside)) - own_mean)
+            if dr.hint(albedo is not None, mode="scalar"):
+                change = mi.Spectrum(albedo.at_world(p, inside)) * share
+                change *= mi.Spectrum(medium.sigma_t.at_world(p, inside))
+                collided += dr.select(inside, change, 0)
+            if dr.hint(emission is not None, mode="scalar"):
+                there = inside & medium.emission.covers(p)
+                emitted += dr.select(there, mi.Spectrum(emission.at_world(p, there)) * share, 0)
+            k += 1
+        return extinction, collided, emitted
 
     @symbolic
     def extinction(self):

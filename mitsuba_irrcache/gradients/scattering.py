@@ -65,11 +65,23 @@ def with_channels(ordinates: Ordinates, channels: Sequence[int]) -> Ordinates:
     return ordinates._replace(incoming=incoming)
 
 
+class OneMoment:
+    """The irradiance as the only moment of the radiance, see `Moments`."""
+
+    count, degrees = 1, (0,)
+
+    def basis(self, direction: mi.Vector3f) -> list[mi.Float]:
+        """Return the moments of an irradiance of 1 from ``direction``."""
+        return [mi.Float(1)]
+
+
 class IsotropicScattering:
     """Isotropic scattering: order 0 of `AnisotropicScattering`."""
 
     #: numbers of components of the fluence, and of the adjoint fluence of camera rays
     count = camera_count = 1
+    #: the basis of the components
+    moments = OneMoment()
     #: whether channels of the same extinction are swept together
     joins_channels = True
     #: number of pairs of ordinates with which the adjoint equation is solved
@@ -135,6 +147,14 @@ class IsotropicScattering:
         """
         return fluence[0] * adjoint[0] * dr.inv_four_pi
 
+    def product_factors(self) -> list[float]:
+        """Return the factors of the products of components of which `product` is the sum."""
+        return [dr.inv_four_pi]
+
+    def isotropic(self, radiance: mi.Float) -> Components:
+        """Return the components of a ``radiance`` that is the same in all directions."""
+        return [radiance]
+
     def into(self, scattered: Components, direction: mi.Vector3f) -> mi.Float:
         """Return the radiance that is scattered into a ``direction``."""
         return scattered[0]
@@ -160,17 +180,17 @@ class AnisotropicScattering(IsotropicScattering):
     joins_channels = False
 
     def __init__(self, basis: AngularBasis) -> None:
-        self.basis, self._moments = basis, Moments(basis)
-        self.count = self._moments.count
+        self.basis, self.moments = basis, Moments(basis)
+        self.count = self.moments.count
         self.camera_count = self.count + len(basis.sources)
         self.solving_pairs = directions_of(basis.order) // 2
-        moments = [float(basis.phase.moments[degree]) for degree in self._moments.degrees]
+        moments = [float(basis.phase.moments[degree]) for degree in self.moments.degrees]
         self._factors = [dr.opaque(mi.Float, 4 * np.pi * g) for g in moments]
 
     def new_level(
         self, sigma_t: mi.Float, albedo: list[mi.Float], tracks: Tracks
     ) -> MultigridLevel:
-        return AnisotropicMultigridLevel(sigma_t, *albedo, tracks, moments=self._moments)
+        return AnisotropicMultigridLevel(sigma_t, *albedo, tracks, moments=self.moments)
 
     def joined(self, channels: list[Components]) -> mi.Float:
         (components,) = channels
@@ -199,7 +219,7 @@ class AnisotropicScattering(IsotropicScattering):
         return [n for n, source in enumerate(self.basis.sources, 1) if not source.far]
 
     def from_direction(self, irradiance: mi.Float, towards: mi.Vector3f) -> Components:
-        return [irradiance * y for y in self._moments.basis(towards)]
+        return [irradiance * y for y in self.moments.basis(towards)]
 
     def of_parts(self, camera: Components, travelled: Components) -> list[Components]:
         smooth = [a + b for a, b in zip(travelled, camera, strict=False)]
@@ -211,6 +231,16 @@ class AnisotropicScattering(IsotropicScattering):
     def scattered(self, components: Components, scale: mi.Float) -> Components:
         return [scale * g * layer for g, layer in zip(self._factors, components, strict=True)]
 
+    def scattered_by(
+        self, components: Components, scale: mi.Float, moments: np.ndarray
+    ) -> Components:
+        """Return the components that a phase function with other ``moments`` scatters.
+
+        ``scale`` is the scattering coefficient.
+        """
+        factors = [dr.opaque(mi.Float, float(moments[n])) for n in self.moments.degrees]
+        return [scale * g * layer for g, layer in zip(factors, components, strict=True)]
+
     def product(
         self, fluence: Components, adjoint: Components, moments: np.ndarray | None = None
     ) -> mi.Float:
@@ -219,18 +249,24 @@ class AnisotropicScattering(IsotropicScattering):
         ``moments`` are those of another phase function, if not that of the medium is meant.
         """
         # docs/primer, eq. (8.13)
+        triples = zip(self.product_factors(moments), fluence, adjoint, strict=True)
+        return sum(factor * a * b for factor, a, b in triples)
+
+    def product_factors(self, moments: np.ndarray | None = None) -> list[mi.Float]:
         moments = self.basis.phase.moments if moments is None else moments
         # The importance propagates in the opposite direction, where odd moments change their sign.
-        factors = [
+        return [
             dr.opaque(mi.Float, (-1) ** n * float(moments[n]) / (1 if n else 4 * np.pi))
-            for n in self._moments.degrees
+            for n in self.moments.degrees
         ]
-        triples = zip(factors, fluence, adjoint, strict=True)
-        return sum(factor * a * b for factor, a, b in triples)
+
+    def isotropic(self, radiance: mi.Float) -> Components:
+        none = dr.zeros(mi.Float, dr.width(radiance))
+        return [4 * dr.pi * radiance, *[none] * (self.count - 1)]
 
     def into(self, scattered: Components, direction: mi.Vector3f) -> mi.Float:
         first, *higher = scattered
-        _, *basis = self._moments.basis(-direction)
+        _, *basis = self.moments.basis(-direction)
         return first * dr.inv_four_pi + sum(s * y for s, y in zip(higher, basis, strict=True))
 
     def along(self, level: MultigridLevel, scattered: Components, group: PairGroup) -> mi.Float:

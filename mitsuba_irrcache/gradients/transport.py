@@ -116,7 +116,7 @@ class AdjointTransport:
         self.channels = self.ordinates.incoming.shape[-1] if settings.grey else colours
         solving_pairs = min(pairs, self.scattering.solving_pairs)
         (solving,) = illumination.ordinates(1, solving_pairs, rng)
-        self._solving = solving.scattering().without_incoming()
+        self.solving = solving.scattering().without_incoming()
         voxels = dr.arange(mi.UInt32, grid.voxel_count)
         self.positions = VoxelSamplePoints(scene, grid).of(voxels)
         self.point_lights = illumination.point_lights
@@ -215,6 +215,10 @@ class AdjointTransport:
         at.p = self.positions
         return self.point_lights[light].sample_direction(at, mi.Point2f(0.5))[0].d
 
+    def part_of_point(self, light: int) -> int:
+        """Return the index of the part of the radiance to which a point-like light belongs."""
+        return self._point_parts[light]
+
     def derivative_by_point(self, light: int, found: Derivatives) -> mi.Spectrum:
         """Return the derivatives with respect to the irradiance of a point-like light, by voxel."""
         direction, part = self.towards_point(light), self._point_parts[light]
@@ -243,8 +247,8 @@ class AdjointTransport:
                 if EMISSION in self._wanted:
                     centres += self._irradiances(level.sweep(source, table)[0], own)
             else:
-                _, first = level.sweep(source, level.tracks.table(*self._solving))
-                phi = source + level.solve(first, self._solving)
+                _, first = level.sweep(source, level.tracks.table(*self.solving))
+                phi = source + level.solve(first, self.solving)
                 dr.eval(phi)
                 irradiance, phi = level.sweep(phi, table)
                 centres += self._irradiances(irradiance, own)

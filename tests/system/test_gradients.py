@@ -438,14 +438,6 @@ def test_emission_of_zero_is_refused(rgb):
     assert "the emission is 0 everywhere" in refused(scene, "emission.data")
 
 
-def test_forward_mode_is_refused(rgb):
-    scene, params, key = small()
-    dr.enable_grad(params[key])
-    params.update()
-    with pytest.raises(IrrcacheError, match=r"sigma_t\.data.*dr\.forward was called"):
-        dr.forward_to(mi.render(scene, params, spp=1))
-
-
 # Numbers
 
 

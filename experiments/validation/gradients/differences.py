@@ -73,6 +73,27 @@ def gradients(
     return found
 
 
+def derivatives(
+    scene: mi.Scene, name: str, weights: np.ndarray, steps: list[np.ndarray]
+) -> np.ndarray:
+    """Derivatives of the objective along ``steps`` of a parameter, by forward mode."""
+    params = mi.traverse(scene)
+    key, found = key_of(params, name), []
+    kind, shape = type(params[key]), np.array(params[key]).shape
+    for step in steps:
+        leaf = kind(dr.detach(params[key]))
+        dr.enable_grad(leaf)
+        params[key] = leaf
+        params.update()
+        flat = np.broadcast_to(step, shape).astype(np.float32)
+        dr.set_grad(leaf, kind(flat if len(shape) != 1 else flat.ravel()))
+        change = dr.forward_to(mi.render(scene, params, spp=SPP_GRAD, seed=3))
+        found.append(float((np.array(change, dtype=np.float64) * weights).sum()))
+        params[key] = dr.detach(leaf)
+        params.update()
+    return np.array(found)
+
+
 def directions(case: Case, name: str, value: np.ndarray, count: int) -> list[np.ndarray]:
     """Perturbations of a parameter: ``count`` smooth ones of a grid, each channel of a constant."""
     if value.ndim == 3:  # an environment map

@@ -3,22 +3,33 @@
     python -m experiments.validation.gradients.run [--case NAME] [--document docs/validation.md]
 
 The first table has for each case and parameter the relative error and the cosine of directional
-derivatives along smooth perturbations (`differences`), the second one errors by voxel at equal
-CPU time (`beside_prb`). ``--case`` runs the cases of the first table whose names contain it.
+derivatives along smooth perturbations (`differences`), and the error in forward mode, the second
+one errors by voxel at equal CPU time (`beside_prb`). ``--case`` runs the cases of the first table
+whose names contain it.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from time import process_time
 
 import mitsuba as mi
+import numpy as np
 
 from experiments.support.documents import replace_tables
 from experiments.support.options import add_document, begin
 from experiments.validation.gradients import beside_prb
 from experiments.validation.gradients.cases import CASES, Case
-from experiments.validation.gradients.differences import compare, gradients, pixel_weights
+from experiments.validation.gradients.differences import (
+    BLOBS,
+    compare,
+    derivatives,
+    directions,
+    gradients,
+    key_of,
+    pixel_weights,
+)
 from mitsuba_irrcache.compare.tables import Table
 
 
@@ -51,7 +62,7 @@ def differences(chosen: str) -> Table:
             for row in _rows(name, case):
                 print("  ".join(row), flush=True)
                 cells.append(row)
-    head = ["case", "parameter", "error", "cosine", "CPU s"]
+    head = ["case", "parameter", "error", "cosine", "forward mode", "CPU s"]
     return Table("Gradients against finite differences", head, cells)
 
 
@@ -64,8 +75,12 @@ def _rows(name: str, case: Case) -> list[list[str]]:
     rows = []
     for parameter, gradient in found.items():
         result = compare(scene, case, parameter, weights, gradient)
-        cells = f"{result.error:.2%}", f"{result.cosine:.5f}", f"{seconds:.2f}"
-        rows.append([name, parameter, *cells])
+        params = mi.traverse(scene)
+        value = np.array(params[key_of(params, parameter)], dtype=np.float64)
+        steps = directions(case, parameter, value, BLOBS)
+        forward = replace(result, adjoint=derivatives(scene, parameter, weights, steps))
+        cells = f"{result.error:.2%}", f"{result.cosine:.5f}", f"{forward.error:.2%}"
+        rows.append([name, parameter, *cells, f"{seconds:.2f}"])
     return rows
 
 

@@ -56,6 +56,10 @@ class SweptVolume:
     angles, and the irradiance excludes the source of the voxel itself. With ``collisions`` there
     are two values instead of four: the radiance of collisions without the source of the voxel, and
     the optical depth.
+
+    With ``emission``, ``source`` is radiance per length instead, which voxels without extinction
+    have, too: "uniform" in a voxel, or "decaying" along each track like radiance that is attenuated
+    by the voxel, with this value in its middle. Irradiance then includes the voxel's own.
     """
 
     values: mi.Float
@@ -64,6 +68,7 @@ class SweptVolume:
     channels: int = 1
     begin_backward: mi.UInt32 | None = None
     collisions: bool = False
+    emission: str | None = None
 
 
 class CarriedRadiance:
@@ -432,7 +437,7 @@ class _PairSweep:
         self.weight, self.scale = record.weight, record.quantum * record.length
         # Cross section of the tube that a track represents, over the volume of a voxel: the tubes
         # of an ordinate fill the volume.
-        self.area = dr.rcp(record.length)
+        self.length, self.area = record.length, dr.rcp(record.length)
         #: what optical depths are multiplied by
         self.solid_angle = mi.Float(1) if self.separate else record.weight
 
@@ -561,8 +566,9 @@ class _PairSweep:
             else:
                 sources = [[value.x for value in voxel] for voxel in before]
         sources = [_scale(sent, self.weight) for sent in sources]
+        cross = self._cross_voxel if self.volume.emission is None else self._cross_emitting_voxel
         crossed = [
-            self._cross_voxel(state, light, sent, halves)
+            cross(state, light, sent, halves)
             for state, light, sent, halves in zip(
                 states, radiance, sources, extinction, strict=True
             )
@@ -581,7 +587,9 @@ class _PairSweep:
         radiance, tallies = ([way[i] for way in crossed] for i in range(2))
         if self.separate:
             for visit, tally, sent in zip(visits, tallies, sources, strict=True):
-                own = [t - mi.Vector4f(0, s, 0, 0) for t, s in zip(tally, sent, strict=True)]
+                own = tally
+                if self.volume.emission is None:
+                    own = [t - mi.Vector4f(0, s, 0, 0) for t, s in zip(tally, sent, strict=True)]
                 visit.write(values, collisions(own) if self.volume.collisions else own)
         else:
             self._add_both(values, before, tallies, visits, middle)
@@ -624,6 +632,43 @@ class _PairSweep:
             lost, middle = (x - sent) * share, dr.fma(x - sent, to_centre, sent)
             behind.append(x - lost)
             tally.append(mi.Vector4f(0, middle, lost * area, count * tau * area))
+        return behind, tally
+
+    def _cross_emitting_voxel(
+        self, state: _TrackState, radiance: list, emission: list, extinction: tuple
+    ) -> tuple[list, list]:
+        """Propagate radiance through a voxel that emits radiance per length.
+
+        Returns what `_cross_voxel` returns.
+        """
+        # docs/primer, eq. (8.17)
+        first, second = (half * self.scale for half in extinction)
+        ahead = dr.select(state.since_entry < 1, state.since_entry, 0.5)
+        to_middle = ahead * first
+        tau = dr.fma(second, 0.5, to_middle)
+        transmittance = decay(tau)
+        share = absorbed(tau, transmittance)
+        # Shares of the emission that leave the voxel, collide in it, and pass its middle.
+        half, thin = 0.5 * tau, tau < 0.02
+        if self.volume.emission == "decaying":
+            series = dr.fma(half * half, 1 / 6, 1)
+            leaving, passing = decay(half), mi.Float(1)
+            total = dr.select(half < 0.1, series, dr.sinh(half) / half)
+            colliding = dr.select(thin, half * dr.fma(tau, -1 / 6, 1), total - leaving)
+        else:
+            leaving = dr.select(tau > 0, share / tau, 1)
+            lost = absorbed(to_middle, decay(to_middle))
+            passing = dr.select(to_middle > 0, lost / to_middle, 1)
+            colliding = dr.select(thin, half * dr.fma(tau, -1 / 3, 1), 1 - leaving)
+        depth, to_centre = self.solid_angle * tau * self.area, decay(to_middle)
+        behind, tally = [], []
+        for x, sent in zip(radiance, emission, strict=True):
+            emitted = sent * self.length
+            middle = dr.fma(x, to_centre, emitted * ahead * passing)
+            emitted = emitted * (ahead + 0.5)
+            behind.append(dr.fma(x, transmittance, emitted * leaving))
+            collided = dr.fma(x, share, emitted * colliding)
+            tally.append(mi.Vector4f(0, middle, collided * self.area, depth))
         return behind, tally
 
     # Surfaces among the voxels

@@ -191,7 +191,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
         groups = self.tracks.sweep_separately(table, source, self.channels, not with_irradiance)
         for _, group, copies in groups:
             sums = received, collided, lost, depth
-            received, collided, lost, depth = _add_collided(moments, sums, copies, group, *where)
+            received, collided, lost, depth = add_collided(moments, sums, copies, group, *where)
             dr.eval(received, collided, lost, depth)
         # Weighting by optical depth makes scattering conserve the energy of collisions.
         weighted = 4 * dr.pi * lost / dr.select(depth > 0, depth, 1)
@@ -288,7 +288,7 @@ def _add_uncollided(
 
 
 @symbolic
-def _add_collided(
+def add_collided(
     moments: Moments,
     sums: tuple,
     copies: mi.Float,

@@ -205,14 +205,16 @@ class Tracks:
         source: Callable[[PairGroup], mi.Float] | None = None,
         channels: int = 1,
         collisions: bool = False,
+        emission: str | None = None,
     ) -> Iterator[tuple[int, PairGroup, mi.Float]]:
         """Sweep groups of pairs; yield the dominant axis, the group, and the results of each.
 
         The results of a group are consecutive volumes, two per pair, along the axis and against it.
         ``source(group)`` returns volumes of the radiance that voxels emit or scatter. With a
         source, results have the four values of `sweep` per voxel and channel, or the two of
-        ``collisions`` (see `SweptVolume`), which are undefined where there is no track; without,
-        they have one value, irradiance, laid out by slices. Channels of a voxel are adjacent.
+        ``collisions`` (see `SweptVolume`, also for ``emission``), which are undefined where there
+        is no track; without, they have one value, irradiance, laid out by slices. Channels of a
+        voxel are adjacent.
         """
         values, width = self.grid.voxel_count * channels, (2 if collisions else 4) if source else 1
         most = max(1, MAX_COPIED_VOXELS * 4 // (2 * values * width))
@@ -233,6 +235,7 @@ class Tracks:
                     channels,
                     begin + dr.opaque(mi.UInt32, values),
                     collisions,
+                    emission,
                 )
                 sweep_tracks(medium, volume, table, group.pair(number), track)
                 dr.eval(copies)

@@ -1,0 +1,122 @@
+"""Forward mode for the radiance of emitters, on which images depend linearly."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.gradients.emitters import solid_angles
+from mitsuba_irrcache.gradients.transport import AdjointTransport
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+
+
+class EmitterTangents:
+    """Changes of the emitters of ``scene``.
+
+    ``changes`` has the change of the parameter on which the radiance of an emitter depends and the
+    value and key of this parameter, by emitter.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, changes: dict[mi.Emitter, tuple[object, object, str]]
+    ) -> None:
+        self._scene, self._changes = scene, changes
+        environment = scene.environment()
+        self._environment = None
+        if environment in changes:
+            change, *_ = changes[environment]
+            self._environment = _ChangedEnvironment(environment, change)
+
+    def __len__(self) -> int:
+        return len(self._changes)
+
+    def background(self, ray: mi.Ray3f) -> mi.Spectrum:
+        """Return the change of the radiance of the environment that rays see."""
+        return mi.Spectrum(0) if self._environment is None else self._environment.along(-ray.d)
+
+    def points(self, transport: AdjointTransport) -> list[mi.Spectrum]:
+        """Return the changes of the irradiance of point-like lights in all voxels."""
+        found = []
+        for emitter, irradiance in zip(transport.point_lights, transport.from_points, strict=True):
+            factor = [0.0] * dr.size_v(mi.Spectrum)
+            channel = 0
+            if emitter in self._changes:
+                channel, factor = _relative(*self._changes[emitter])
+            factors = mi.Spectrum([dr.opaque(mi.Float, f) for f in factor])
+            found.append(factors * irradiance[channel])
+        return found
+
+    def incoming(self, transport: AdjointTransport) -> np.ndarray | None:
+        """Return the changes (n, 2, channels) of the irradiance that enters along the ordinates;
+        None if there are none.
+        """
+        suns = [e for e in self._scene.emitters() if kind_of(e) is EmitterKind.SUN]
+        if self._environment is None and not any(sun in self._changes for sun in suns):
+            return None
+        directions, incoming, *_ = transport.ordinates
+        tracks, result = transport.sun_tracks, np.zeros((len(directions), 2, transport.channels))
+        end = len(directions) - len(suns) * tracks
+        for number, sun in enumerate(suns):
+            if sun in self._changes:
+                rows = slice(end + number * tracks, end + (number + 1) * tracks)
+                channel, factor = _relative(*self._changes[sun])
+                result[rows] = incoming[rows][..., [channel]] * np.array(factor)
+        if self._environment is not None:
+            both = np.stack([directions[:end], -directions[:end]], axis=1).reshape(-1, 3)
+            angle = solid_angles(self._scene.environment(), both, incoming[:end])
+            change = self._environment.along(mi.Vector3f(both.T.astype(np.float32)))
+            values = [np.broadcast_to(np.array(c, np.float64), len(both)) for c in change]
+            result[:end] = np.stack(values, axis=1).reshape(end, 2, -1) * angle
+        return result
+
+
+class _ChangedEnvironment:
+    """The change of the radiance of an environment whose parameter changes."""
+
+    def __init__(self, environment: mi.Emitter, change: object) -> None:
+        self._constant, self._maps = None, []
+        if kind_of(environment) is EmitterKind.CONSTANT_ENVIRONMENT:
+            self._constant = mi.Spectrum(change)
+            return
+        # Maps are sampled in proportion to their luminance, which has to be positive.
+        for sign in (1, -1):
+            values = np.maximum(sign * np.array(change), 0)
+            if values.any():
+                self._maps.append((sign, _like(environment, values)))
+
+    def along(self, direction: mi.Vector3f) -> mi.Spectrum:
+        """Return the change along each ``direction`` of propagation."""
+        if self._constant is not None:
+            return self._constant
+        interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
+        interaction.wi = direction
+        return sum((sign * own.eval(interaction) for sign, own in self._maps), mi.Spectrum(0))
+
+
+def _like(environment: mi.Emitter, values: np.ndarray) -> mi.Emitter:
+    """Return an environment map with other texels."""
+    own = mi.traverse(environment)
+    start = np.ones((values.shape[0], values.shape[1] - 1, 3), dtype=np.float32)
+    place = mi.ScalarTransform4f(np.array(own["to_world"].matrix, dtype=np.float64).reshape(4, 4))
+    result = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(start), "to_world": place})
+    params = mi.traverse(result)
+    params["scale"] = own["scale"]
+    params["data"] = type(params["data"])(values.astype(np.float32))
+    params.update()
+    return result
+
+
+def _relative(change: object, value: object, key: str) -> tuple[int, list[float]]:
+    """Return the brightest channel of an emitter, and changes of all, relative to that channel."""
+    count = dr.size_v(mi.Spectrum)
+    columns = (np.array(mi.Spectrum(dr.detach(v)), np.float64) for v in (value, change))
+    values, changes = (column.reshape(count, -1)[:, 0] for column in columns)
+    channel = int(values.argmax())
+    if values[channel] <= 0:
+        raise IrrcacheError(
+            f'irrcache: dr.forward from "{key}" needs a positive value, not {values.max():g}; '
+            "start with a small positive one, or use dr.backward."
+        )
+    return channel, (changes / values[channel]).tolist()

@@ -1,0 +1,166 @@
+"""Forward mode: against reverse mode, and in the interface of Dr.Jit."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from experiments.validation.gradients.cases import CASES, Case
+from experiments.validation.gradients.differences import (
+    compare,
+    derivatives,
+    directions,
+    gradients,
+    key_of,
+    pixel_weights,
+)
+from mitsuba_irrcache.errors import IrrcacheError
+
+#: Largest relative difference between the derivatives of both modes: both discretise the same
+#: operators, whose transposes agree within a few thousandths.
+DIFFERENCE = 0.01
+PERTURBATIONS = 3
+
+
+def check(case: Case, difference: float = DIFFERENCE) -> None:
+    """The derivative along perturbations of each parameter is that by reverse mode (dot test)."""
+    scene = case.load()
+    weights = pixel_weights(scene)
+    reverse = gradients(scene, case.parameters, weights)
+    for name, gradient in reverse.items():
+        params = mi.traverse(scene)
+        value = np.array(params[key_of(params, name)], dtype=np.float64)
+        steps = directions(case, name, value, PERTURBATIONS)
+        forward = derivatives(scene, name, weights, steps)
+        expected = [(gradient.reshape(value.shape) * step).sum() for step in steps]
+        assert np.linalg.norm(forward - expected) < difference * np.linalg.norm(expected), name
+
+
+@pytest.mark.parametrize("name", ["sky, single", "sky", "point", "empty voxels", "gaussian filter"])
+def test_both_modes_agree(mono, name):
+    # The albedo of empty voxels matters only through the extinction interpolated into them.
+    check(CASES[name], 0.02 if name == "empty voxels" else DIFFERENCE)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "coloured extinction",
+        "alpha",
+        "emission",
+        "radiance of sky and sun, single",
+        "texels of an envmap",
+    ],
+)
+def test_both_modes_agree_in_colour(rgb, name):
+    check(CASES[name])
+
+
+@pytest.mark.parametrize("name", ["hg 0.3, sun", "hg 0.65, sun"])
+def test_both_modes_agree_with_anisotropic_scattering(mono, name):
+    check(CASES[name], 0.02)
+
+
+def test_forward_mode_is_the_difference_of_images(mono):
+    case = CASES["sky"]
+    scene = case.load()
+    weights, params = pixel_weights(scene), mi.traverse(scene)
+    value = np.array(params[key_of(params, "sigma_t")], dtype=np.float64)
+    (step,) = directions(case, "sigma_t", value, 1)
+    (found,) = derivatives(scene, "sigma_t", weights, [step])
+    result = compare(scene, case, "sigma_t", weights, np.zeros(value.shape), 1)
+    assert found == pytest.approx(result.differences[0], rel=0.02)
+
+
+# Interface
+
+
+def attached(scene: mi.Scene) -> tuple[mi.SceneParameters, mi.Float, mi.TensorXf]:
+    """Parameters whose extinction is multiplied by a factor that carries gradients."""
+    params = mi.traverse(scene)
+    key = key_of(params, "sigma_t")
+    data, factor = mi.TensorXf(dr.detach(params[key])), mi.Float(1)
+    dr.enable_grad(factor)
+    params[key] = data * factor
+    params.update()
+    return params, factor, data
+
+
+def test_derivatives_of_upstream_variables_reach_the_image(rgb):
+    """By ``dr.forward_from``, and by ``render_forward`` itself: a derivative per pixel."""
+    scene = Case(data=8, cache=8).load()
+    params, factor, data = attached(scene)
+    image = mi.render(scene, params, spp=64, seed=1)
+    dr.forward(factor)
+    found = np.array(dr.grad(image))
+    assert found.shape == image.shape
+    images = []
+    for scale in (0.97, 1.03):
+        params[key_of(params, "sigma_t")] = data * scale
+        params.update()
+        images.append(np.array(mi.render(scene, spp=64, seed=1)))
+    expected = (images[1] - images[0]) / 0.06
+    assert np.linalg.norm(found - expected) < 0.03 * np.linalg.norm(expected)
+
+
+def test_several_views_share_the_solve(rgb, monkeypatch):
+    from mitsuba_irrcache.gradients.tangent_transport import FluenceTangent
+
+    calls, solve = [], FluenceTangent.for_camera
+    monkeypatch.setattr(
+        FluenceTangent, "for_camera", lambda *args: calls.append(args) or solve(*args)
+    )
+    scene = Case(data=8, cache=8).load()
+    params, factor, _ = attached(scene)
+    images = [mi.render(scene, params, spp=4, seed=seed) for seed in (1, 2)]
+    dr.forward(factor)
+    assert len(calls) == 1
+    assert all(np.array(dr.grad(image)).any() for image in images)
+
+
+def test_forward_and_reverse_mode_do_not_disturb_each_other(rgb):
+    scene = Case(data=8, cache=8).load()
+    params, factor, _ = attached(scene)
+    found = []
+    for mode in (dr.backward, dr.forward_to, dr.backward):
+        dr.clear_grad(factor)
+        params[key_of(params, "sigma_t")] = dr.detach(params[key_of(params, "sigma_t")]) * factor
+        params.update()
+        loss = dr.mean(mi.render(scene, params, spp=16, seed=1))
+        if mode is dr.forward_to:
+            dr.set_grad(factor, 1.0)
+            found.append(float(np.array(dr.forward_to(loss)).item()))
+        else:
+            mode(loss)
+            found.append(float(dr.grad(factor)[0]))
+    assert found[0] == found[2]
+    assert found[1] == pytest.approx(found[0], rel=0.01)
+
+
+def test_without_gradients_the_derivative_is_zero(rgb):
+    scene = Case(data=8, cache=8).load()
+    found = scene.integrator().render_forward(scene, mi.traverse(scene), spp=1)
+    assert found.shape == (32, 32, 3)
+    assert not np.array(found).any()
+
+
+def test_what_reverse_mode_refuses_forward_mode_refuses(rgb):
+    scene = Case(data=8, cache=8).load()
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if k.endswith("x_fov")]
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(IrrcacheError, match="x_fov"):
+        dr.forward_to(mi.render(scene, params, spp=1))
+
+
+def test_lights_without_radiance_are_refused_by_name(rgb):
+    light = {"type": "point", "position": [0.0, 3.0, 0.0], "intensity": 0.0}
+    scene = Case(data=8, cache=8, emitters=lambda: {"lamp": light}).load()
+    params = mi.traverse(scene)
+    dr.enable_grad(params["lamp.intensity.value"])
+    params.update()
+    with pytest.raises(IrrcacheError, match=r"lamp\.intensity\.value.*positive"):
+        dr.forward_to(mi.render(scene, params, spp=1))
