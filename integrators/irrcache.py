@@ -228,10 +228,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     medium, by ``g`` of its phase function ``hg``, and by the radiance of emitters, by solving the
     adjoint transport equation: for one medium in a box or sphere under distant and point emitters
     (not inside of it if delta-M applies), without surfaces, with the solver ``sweep``,
-    ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. Emissive media have gradients by ``emission`` only. All other gradients
-    are refused with an error that names the parameter. While parameters carry gradients, the grid
-    of the cache is kept. Images of the same state of the scene in one loss
-    share one adjoint solve; ``cache_spp`` also sets its directions.
+    ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. Emissive media have gradients by
+    ``emission`` only. All other gradients are refused with an error that names the parameter. While
+    parameters carry gradients, the grid of the cache is kept. Images of the same state of the scene
+    in one loss share one adjoint solve; ``cache_spp`` also sets its directions.
 
     .. tabs::
         .. code-tab:: xml
