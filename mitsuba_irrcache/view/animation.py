@@ -101,7 +101,8 @@ def _frames(session: Session, view: View, cameras: Sequence[Camera]) -> Iterator
         for camera in cameras:
 
             def begin(camera: Camera = camera) -> Samples:
-                return Samples(session.light.seen(look.layered, look.with_error), camera, view.size)
+                seen = session.light.seen(look.layered, look.with_error)
+                return Samples(seen, camera, view.size, slices=look.slices)
 
             samples = session.call(begin)
             while samples.count < SAMPLES:

@@ -114,6 +114,12 @@ class Document:
         return self._environment(self._root) is not None
 
     @property
+    def has_environment_map(self) -> bool:
+        """Return whether the environment is not the same in all directions."""
+        found = self._environment(self._root)
+        return found is not None and found.get("type") != "constant"
+
+    @property
     def density(self) -> float:
         """Return the factor of the extinction of all media."""
         scales = [float(m.find("float[@name='scale']").get("value")) for m in self._scaled()]

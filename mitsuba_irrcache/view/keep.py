@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from mitsuba_irrcache import __version__
@@ -61,8 +62,10 @@ def keep(
         return [exr, png, *caches.values(), *_write_scene(session, view, path, samples, caches)]
 
     with session.reserved():
-        samples = _samples(session, view, layered=True)
-        plain = _samples(session, view, layered=False) if not view.look.layered else samples
+        without = replace(view, look=replace(view.look, slices=None))
+        samples = _samples(session, without, layered=True)
+        is_same = view.look.layered and view.look.slices is None
+        plain = samples if is_same else _samples(session, view, layered=view.look.layered)
         return session.call(lambda: write(samples, plain))
 
 
@@ -91,8 +94,9 @@ def _samples(session: Session, view: View, layered: bool) -> Samples:
     """
 
     def begin() -> Samples:
-        seen = session.light.seen(layered, layered)
-        return session.complete(seen, view) or Samples(seen, view.camera, view.size)
+        seen, slices = session.light.seen(layered, layered), view.look.slices
+        known = session.complete(seen, view)
+        return known or Samples(seen, view.camera, view.size, slices=slices)
 
     samples = session.call(begin)
     while samples.count < SAMPLES:

@@ -37,7 +37,7 @@ class LightPanel:
                 self._light("environment", lighting.environment, 0.0, 10.0, gui)
             self._sun = self._light("sun", lighting.sun, 0.0, 1000.0, gui)
             gui.add_html("<irrcache-light></irrcache-light>")
-            if document.has_environment:
+            if document.has_environment_map:
                 self._light("rotation", lighting.rotation, -180.0, 180.0, gui, slider=True)
             hidden = gui.add_checkbox(
                 "hide emitters", document.seeing.hide_emitters,

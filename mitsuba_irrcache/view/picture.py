@@ -17,6 +17,7 @@ from mitsuba_irrcache.render.film import PixelPositions
 from mitsuba_irrcache.render.pixel_filter import pixel_of
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Seen
+from mitsuba_irrcache.view.slices import SlicedCameraRays, Slices
 
 #: The kind of image in which pixels with too large an error bar are marked, the colour of the
 #: marks, and the share of the brightest pixels below which an error is not relative any more.
@@ -49,7 +50,8 @@ class Look:
     """What to display and how: one of `KINDS`, ``exposure`` in stops, and one of `TONES`.
 
     ``filtered`` says whether the illumination is filtered; ``background`` is the colour behind the
-    image, linear RGB in [0, 1], where emitters are hidden. The exposure does not change it.
+    image, linear RGB in [0, 1], where emitters are hidden. The exposure does not change it, nor
+    ``slices`` of the values.
     """
 
     kind: str = "image"
@@ -58,6 +60,7 @@ class Look:
     filtered: bool = False
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     target: float = 0.0
+    slices: Slices | None = None
 
     @property
     def layered(self) -> bool:
@@ -72,12 +75,19 @@ class Look:
 class Samples:
     """The sum of camera samples of one view of one state of the caches.
 
-    ``size`` is (width, height).
+    ``size`` is (width, height). Rays end at ``slices``.
     """
 
-    def __init__(self, seen: Seen, camera: Camera, size: tuple[int, int], seed: int = 0) -> None:
+    def __init__(
+        self,
+        seen: Seen,
+        camera: Camera,
+        size: tuple[int, int],
+        seed: int = 0,
+        slices: Slices | None = None,
+    ) -> None:
         self.seen, self.camera, self.size, self.seed = seen, camera, size, seed
-        self.count = 0
+        self.slices, self.count = slices, 0
         self._sums: list[mi.Float] = []
 
     def add(self, total: int, pause: Callable[[], None] | None = None) -> None:
@@ -114,7 +124,7 @@ class Samples:
     def layers(self) -> Layers:
         """Return the layers as means over the samples; without layers, all is background."""
         scale = dr.opaque(mi.Float, 1 / self.count)
-        means = [s * scale for s in self._sums[:-1]]
+        means = [s * scale for s in self._sums[: -1 if self.slices is None else -4]]
         if not self.seen.layered:
             return Layers.background_only(mi.Spectrum(*means))
         return Layers.of(means)
@@ -144,11 +154,15 @@ class Samples:
         return _display(self._shown(look, extent), look, self.size, self.behind(look))
 
     def behind(self, look: Look) -> mi.Color3f:
-        """Return the background where the image is transparent, as it is added to the display."""
+        """Return what is added to the display: slices, and the background where the image is
+        transparent.
+        """
         if look.kind not in ("image", MARKED):
             return mi.Color3f(0)
-        share = self._sums[-1] * dr.opaque(mi.Float, 1 / self.count)
-        return share * mi.Color3f(*(dr.opaque(mi.Float, c) for c in look.background))
+        found = self._sums[-1] * mi.Color3f(*(dr.opaque(mi.Float, c) for c in look.background))
+        if self.slices is not None:
+            found += mi.Color3f(*self._sums[-4:-1])
+        return found * dr.opaque(mi.Float, 1 / self.count)
 
     def channels(self, aovs: tuple[str, ...], filtered: bool = False) -> tuple[np.ndarray, list]:
         """Return image and layers as float32 (height, width, channel), and the channel names."""
@@ -172,13 +186,18 @@ class Samples:
         scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in self.size))
         ray = self.camera.rays(at * scale, width / height)
         medium = seen.medium_at(np.array(self.camera.position))
-        view = seen.camera_rays.sample(seen.scene, sampler, ray, medium, mi.Bool(True))
+        rays, sliced = seen.camera_rays, []
+        if self.slices is not None:
+            rays = SlicedCameraRays(rays, self.slices)
+        view = rays.sample(seen.scene, sampler, ray, medium, mi.Bool(True))
+        if self.slices is not None:
+            sliced = list(rays.shown)
         if seen.layered:
             parts = view.scattered, view.transmittance, view.gathered, view.background
             values = seen.camera_rays.projection.layers(*parts, mi.Spectrum(1)).channels()
         else:
             values = list(view.scattered + view.background)
-        values.append(1 - view.alpha)
+        values += [*sliced, 1 - view.alpha]
         return [value + dr.zeros(mi.Float, len(band)) for value in values]
 
     def _array(self, planes: list[mi.Float]) -> np.ndarray:

@@ -23,6 +23,7 @@ from mitsuba_irrcache.view.channel import PATH, Channel
 from mitsuba_irrcache.view.crop_panel import CropPanel
 from mitsuba_irrcache.view.panel import LightPanel
 from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.slice_panel import SlicePanel
 from mitsuba_irrcache.view.time_panel import TimePanel, TimeSteps
 from mitsuba_irrcache.view.transfer_panel import TransferPanel
 from mitsuba_irrcache.view.visitor import Visitor
@@ -114,9 +115,12 @@ class Server:
         if appearance is not None and appearance.is_editable:
             TransferPanel(self._server, session, appearance, self.panel.editing, self.channel)
         if appearance is not None:
-            CropPanel(self._server, session, appearance, self.panel.editing, self.channel)
+            shared = self._server, session, appearance, self.panel.editing
+            with self._server.gui.add_folder("Crop and slices", order=4.5, expand_by_default=False):
+                CropPanel(*shared)
+                slices = SlicePanel(*shared, self.channel, self._look_again)
         if steps is not None:
-            TimePanel(self._server, session, appearance, self.panel.editing, steps)
+            TimePanel(*shared, steps, slices.show)
         anatomical = appearance is not None and appearance.volume.unit == "HU"
         self.channel.send("axes", ["L", "P", "S"] if anatomical else ["x", "y", "z"])
         session.on_status = self.panel.show
@@ -155,6 +159,11 @@ class Server:
         self._server.scene.set_up_direction(camera.up)
         first.position, first.look_at = place(camera.position), place(camera.target)
         first.up, first.fov = camera.up, math.radians(camera.fov)
+
+    def _look_again(self) -> None:
+        """Request new images for all windows."""
+        for visitor in list(self._visitors.values()):
+            visitor.look_again()
 
     def _connected(self, client: viser.ClientHandle) -> None:
         self.channel.send("preview", b"")  # windows that open later would show an old state

@@ -25,6 +25,7 @@ from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.light import Light, Seen, Status
 from mitsuba_irrcache.view.picture import Look, Samples, exposure_of
+from mitsuba_irrcache.view.slices import Slices
 from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
 
 LOG = logging.getLogger(__name__)
@@ -59,6 +60,8 @@ class Session:
         self.first_look: np.ndarray | None = None
         #: in stops, with which windows begin; set by `start`
         self.exposure = 0.0
+        #: of the values, which windows display unless they compare
+        self.slices: Slices | None = None
         self.status = Status()
         #: log of the thread: (activity, start time, end time), the newest last
         self.history: deque[tuple[str, float, float]] = deque(maxlen=20000)

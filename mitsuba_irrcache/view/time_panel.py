@@ -25,7 +25,10 @@ class TimeSteps:
 
 
 class TimePanel:
-    """Display one of the time ``steps``; the transfer function stays."""
+    """Display one of the time ``steps``; the transfer function stays.
+
+    ``changed`` is called when another one is displayed.
+    """
 
     def __init__(
         self,
@@ -34,8 +37,10 @@ class TimePanel:
         appearance: Appearance,
         editing: Editing,
         steps: TimeSteps,
+        changed: Callable[[], None],
     ) -> None:
         self._session, self._appearance, self._steps = session, appearance, steps
+        self._changed = changed
         with server.gui.add_folder("Time", order=1.5):
             slider = server.gui.add_slider("time step", 0, steps.count - 1, 1, steps.first)
         editing.bind(slider, self._show)
@@ -47,3 +52,4 @@ class TimePanel:
         if volume.values.shape != self._appearance.volume.values.shape:
             raise IrrcacheError(f"time step {step} has another size: {volume.size}.")
         self._appearance.change(self._session.edit, volume=volume, colours=colours)
+        self._changed()

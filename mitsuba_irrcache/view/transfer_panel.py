@@ -42,6 +42,7 @@ class TransferPanel:
         self._history = History(appearance.mapping, appearance.preset or _OWN)
         self._steps = 0  # to travel in the history, as queued
         self._is_step = False  # whether a queued edit ends a step of the history
+        self._newest: object = None  # what a browser calls the edit that was applied last
         gui = server.gui
         with gui.add_folder("Transfer function", order=2):
             self._preset = gui.add_dropdown(
@@ -71,15 +72,18 @@ class TransferPanel:
             "undo": self._history.can(-1),
             "redo": self._history.can(1),
             "json": mapping.to_json(),
+            "edit": self._newest,
         }
         self._channel.send("transfer", state)
 
     def _edited(self, value: object) -> None:
         """Queue an edit by a browser."""
         function = edited(self._appearance.mapping, value)
+        number = int(value["id"])
         self._is_step |= bool(value["done"])
 
         def change() -> None:
+            self._newest = number
             done, self._is_step = self._is_step, False
             self._apply(function, _OWN, done)
 

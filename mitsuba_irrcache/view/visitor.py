@@ -122,7 +122,7 @@ class Visitor:
             self._channel.send("comparison", {"mode": "off"}, self._key)
         colour = self._look.background
         self._look = Look(kind, float(exposure), tone, bool(self._filter.value), colour)
-        self._look_again()
+        self.look_again()
 
     def _set_background(self, value: object) -> None:
         """Queue a colour that the browser sent, as sRGB values in [0, 1]."""
@@ -132,7 +132,7 @@ class Visitor:
         def change() -> None:
             self._look = replace(self._look, background=colour)
             self._channel.send("background", value, self._key)
-            self._look_again()
+            self.look_again()
 
         self.editing.submit("background", change)
 
@@ -142,7 +142,7 @@ class Visitor:
                 f"the field of view is {degrees!r}; it must be {NARROWEST:g} to {WIDEST:g} degrees."
             )
         self.client.camera.fov = math.radians(degrees)
-        self._look_again()
+        self.look_again()
 
     @property
     def _distance_factor(self) -> float:
@@ -163,7 +163,7 @@ class Visitor:
             self.client.camera.look_at = self._aimed
             self.client.camera.fov = math.radians(camera.fov)
         self._fov.value = round(camera.fov, 1)
-        self._look_again()
+        self.look_again()
 
     def _seen(self) -> View | None:
         """Return the view without its comparison, None if there is none yet."""
@@ -183,9 +183,10 @@ class Visitor:
                 self._go_to(self._sensor.value)
                 return
             self._attempts = 0
-        self._look_again()
+        self.look_again()
 
-    def _look_again(self) -> None:
+    def look_again(self) -> None:
+        """Request an image of the present view."""
         camera = self.client.camera
         if camera.image_width < 1 or camera.image_height < 1:
             return
@@ -204,10 +205,12 @@ class Visitor:
             self._go_to(self._sensor.value)  # the window was resized before the camera was moved
             return
         self._channel.send("camera", seen.axes.round(4).tolist(), self._key)
-        look = self._look
+        look, compared = self._look, CHOICES[self._compare.value]
         if look.kind == MARKED:
             look = replace(look, target=self.session.target_error)
-        view = View(seen, size, look, CHOICES[self._compare.value])
+        if compared == "off":  # volpath renders no slices
+            look = replace(look, slices=self.session.slices)
+        view = View(seen, size, look, compared)
         if self._view is not None and view != self._view and view.shows_place_of(self._view):
             self._channel.send("note", "rendering ...", self._key)  # may take seconds
         self._view = view

@@ -134,6 +134,7 @@ class Window:
             had is not None
             and had.count >= SAMPLES
             and (had.seen, had.camera, had.size) == (seen, view.camera, view.size)
+            and had.slices is view.look.slices
         )
 
     def quick(self, light: Light, view: View, extent: tuple[float, float]) -> Picture:
@@ -144,7 +145,7 @@ class Window:
         seen = light.seen(look.layered, look.with_error)
         seen.stride(stride)
         try:
-            samples = Samples(seen, view.camera, size)
+            samples = Samples(seen, view.camera, size, slices=look.slices)
             samples.add(1)
             pixels = samples.picture(look, extent)
         finally:
@@ -170,12 +171,13 @@ class Window:
         seen = light.seen(look.layered, look.with_error)
         samples = self.samples
         known = samples is not None and self._revision == revision
-        if not (known and view.shows_place_of(self._resting) and samples.seen is seen):
-            samples = Samples(seen, view.camera, view.size)
+        known = known and (samples.seen, samples.slices) == (seen, look.slices)
+        if not (known and view.shows_place_of(self._resting)):
+            samples = Samples(seen, view.camera, view.size, slices=look.slices)
             samples.add(1, pause)
         elif self._resting == view:  # unless only the display of the same samples changes
             if samples.count == 1:  # the centre sample is not random
-                samples = Samples(seen, view.camera, view.size)
+                samples = Samples(seen, view.camera, view.size, slices=look.slices)
                 samples.add(SAMPLES, pause)
             samples.add(SAMPLES, pause)
         self.samples, self._resting = samples, view

@@ -18,6 +18,8 @@ CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 #: Seconds after which an expected event counts as missing. Kernels may be compiled before it, while
 #: other programs use the machine.
 PATIENCE = 240.0
+#: Milliseconds for which a folder of the panel moves when it is opened: a click would miss.
+FOLDING = 400
 #: Records the time of every mouse event, and of every displayed image that was made of received
 #: data instead of the page's own. Only final images are sent as PNG.
 _HOOKS = """
@@ -161,8 +163,9 @@ class Window:
         self.page.get_by_role("option", name=pattern).filter(visible=True).first.click()
 
     def unfold(self, folder: str) -> None:
-        """Open a folder of the panel."""
+        """Open a folder of the panel, or close it."""
         self.page.get_by_text(folder, exact=True).click()
+        self.page.wait_for_timeout(FOLDING)
 
     def curve(self) -> list[list[float]]:
         """Return the points [value, opacity] of the transfer function."""

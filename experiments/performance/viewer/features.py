@@ -7,10 +7,14 @@ Every row is tried in a browser with ``irrcache view``; "no" is printed where th
 from __future__ import annotations
 
 import argparse
+import io
 import re
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+import numpy as np
+from PIL import Image
 
 from experiments.performance.viewer.browser import Browser, Window, viewer
 from experiments.support.documents import as_markdown, replace_tables
@@ -49,21 +53,52 @@ def layout(window: Window) -> str:
 
 
 def crop(window: Window) -> str:
-    """Fold out the panel of the crop box."""
+    """Drag the upper face of the crop box downwards by its arrow, whose tip is above it."""
     window.unfold("Crop and slices")
     window.page.get_by_text("y, %", exact=True).wait_for()
-    return "ranges in the panel, edges in the image"
+    window.tick("drag faces")
+    window.page.wait_for_timeout(2000)
+    place, before = window.canvas(), window.page.screenshot(clip=window.canvas())
+    x, y = place["x"] + place["width"] / 2, place["y"] + 0.06 * place["height"]
+    drag(window, (x, y), (x, y + 0.2 * place["height"]))
+    window.page.wait_for_timeout(2000)
+    assert changed(before, window.page.screenshot(clip=place)) > 0.03  # not only the arrow
+    window.page.get_by_role("button", name="whole volume").click()
+    window.tick("drag faces")
+    return "ranges in the panel, faces dragged in the image"
+
+
+def changed(before: bytes, after: bytes) -> float:
+    """Return the share of pixels in which two screenshots differ visibly."""
+    a, b = (np.asarray(Image.open(io.BytesIO(shot)).convert("L"), int) for shot in (before, after))
+    return float((np.abs(a - b) > 30).mean())
+
+
+def drag(window: Window, start: tuple[float, float], end: tuple[float, float]) -> None:
+    """Drag the mouse from one place of the page to another."""
+    mouse = window.page.mouse
+    mouse.move(*start)
+    mouse.down()
+    mouse.move(*end, steps=8)
+    mouse.up()
 
 
 def slices(window: Window) -> str:
-    """Wait for a slice, and draw it in the image."""
+    """Drag a slice in the image by its arrow, then show all three."""
     window.page.locator("irrcache-slice img").wait_for()
-    place, before = window.canvas(), window.page.screenshot(clip=window.canvas())
-    window.tick("in the image")
-    window.page.wait_for_timeout(2000)
-    assert window.page.screenshot(clip=place) != before
-    window.tick("in the image")
-    return "one, in the panel and in the image"
+    place, shown = window.canvas(), len(window.shown())
+    window.choose("in the image", "this one")
+    window.wait_for_picture(shown)
+    window.page.wait_for_timeout(1000)
+    x, y = place["x"] + place["width"] / 2, place["y"] + 0.46 * place["height"]
+    drag(window, (x, y), (x, y - 0.1 * place["height"]))
+    window.page.wait_for_timeout(1000)
+    assert int(window.field("position, %").input_value()) > 55
+    shown = len(window.shown())
+    window.choose("in the image", "all three")
+    window.wait_for_picture(shown)
+    window.choose("in the image", "none")
+    return "three, at their places in the medium, dragged"
 
 
 def background(window: Window) -> str:

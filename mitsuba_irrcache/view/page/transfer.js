@@ -11,6 +11,7 @@
   const HEIGHT = TOP + PLOT + BAND + 12 + AXIS, HIGHEST = 0.999;
   // The axis of opacities is their cube root: those of tissues lie between 0.001 and 0.1.
   const ROOT = 3, LINES = [0.01, 0.1, 0.5];
+  const PATIENCE = 3000; // milliseconds; edits of other windows may replace one of this
   const HELP = "click: add a point; drag: move it; wheel: zoom";
   const clamp = (v, low, high) => Math.min(Math.max(v, low), high);
   const hex = (c) => `#${c.map((v) => Math.round(255 * v).toString(16).padStart(2, "0")).join("")}`;
@@ -63,7 +64,11 @@
     take(state) {
       const first = !this.state;
       this.state = state;
-      if (!this.drag) this.points = { opacity: state.opacity, colour: state.colour };
+      const known = this.sent && state.edit !== this.sent.id && Date.now() < this.sent.until;
+      if (!known && !this.drag) {
+        this.points = { opacity: state.opacity, colour: state.colour };
+        this.sent = null;
+      }
       if (first) this.range = [...state.range];
       this.select(this.selected.curve, this.selected.index);
     }
@@ -259,7 +264,9 @@
 
     /** Send the function; `done` ends a step of the history. */
     tell(done) {
-      this.edited({ opacity: this.points.opacity, colour: this.points.colour, done });
+      // Until the viewer has answered this edit, its answers to earlier ones are out of date.
+      this.sent = { id: Math.floor(1e9 * Math.random()), until: Date.now() + PATIENCE };
+      this.edited({ opacity: this.points.opacity, colour: this.points.colour, done, id: this.sent.id });
       this.select(this.selected.curve, this.selected.index);
     }
 

@@ -21,7 +21,7 @@ from mitsuba_irrcache.view.comparison import (
     rounded,
 )
 from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
-from mitsuba_irrcache.view.crop_panel import checked_box, slice_place
+from mitsuba_irrcache.view.crop_panel import checked_box
 from mitsuba_irrcache.view.picture import CAPTIONS, KINDS
 from mitsuba_irrcache.volumes.colours import Colours
 from mitsuba_irrcache.volumes.data import VolumeData
@@ -40,22 +40,6 @@ def test_crop_boxes_keep_whole_voxels():
     for wrong in (((0, 100),) * 2, ((50, 20),) * 3, ((0, 101),) * 3, ((0, 50, 100),) * 3):
         with pytest.raises(IrrcacheError):
             checked_box(wrong)
-
-
-@pytest.mark.parametrize("axis", range(3))
-def test_slices_lie_where_their_voxels_are(axis):
-    """The pixels of a slice are at the places of its voxels: head, or front, on top."""
-    volume = VolumeData(
-        np.zeros((5, 4, 3)), (1, 2, 3), origin=(7, 8, 9), direction=np.eye(3)[[1, 0, 2]]
-    )
-    centre, right, down = slice_place(volume, axis, 0.5)
-    columns, rows = (1, 2) if axis == 0 else (0, 2) if axis == 1 else (0, 1)
-    upper_left = np.zeros(3)
-    upper_left[axis] = round(0.5 * (volume.size[axis] - 1))
-    upper_left[rows] = 0 if axis == 2 else volume.size[2] - 1
-    found = centre - right / 2 - down / 2
-    found += right / 2 / volume.size[columns] + down / 2 / volume.size[rows]
-    np.testing.assert_allclose(found, (volume.index_to_world @ [*upper_left, 1])[:3])
 
 
 def test_empty_boxes_are_refused():
