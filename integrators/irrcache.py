@@ -67,7 +67,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
          all voxels share), ``path`` (Monte Carlo path tracing from every voxel), or ``auto``:
          ``sweep`` wherever it supports the scene (see below). The log states the choice
          and its reason. Whatever the solver, an opaque homogeneous medium without a ``resolution``
-         has no cache but is treated as a half-space. (Default: ``auto``)
+         has no cache but is treated as a half-space. With ``auto``, and no other property of
+         caches set, ``volpath`` renders an image that it is estimated to need less time for at the
+         same error, such as a small one of a medium in glass of an irregular shape. It then takes
+         as many samples per pixel as this error needs, at least those requested, and after a few
+         such images the cache is built. (Default: ``auto``)
 
      * - resolution
        - |int|
@@ -256,13 +260,17 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._options = Options.of(props)
         settings, rays = self._options.settings, self._options.rays
         self._stopping = StopCondition()
-        self._stock = StockIntegrators(
-            max_depth=settings.max_depth,
-            rr_depth=settings.rr_depth,
-            hide_emitters=rays.hide_emitters,
-            timeout=self._options.timeout,
+        # Instead of a cache: where none is needed, and where it would take longer.
+        self._stock, self._faster = (
+            StockIntegrators(
+                max_depth=settings.max_depth,
+                rr_depth=rr_depth,
+                hide_emitters=rays.hide_emitters,
+                timeout=self._options.timeout,
+            )
+            for rr_depth in (settings.rr_depth, self._options.stock_rr_depth)
         )
-        self._source = CameraRaySource(self._options, self._stopping, self._stock)
+        self._source = CameraRaySource(self._options, self._stopping, self._stock, self._faster)
         self._builder = self._source.builder
         self._image = ImageRenderer(self._options)
         # Held by the images that share it: they hold the integrator.
@@ -365,6 +373,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """End the current rendering, in any thread, with the samples completed so far."""
         self._stopping.cancel()
         self._stock.cancel()
+        self._faster.cancel()
 
     def should_stop(self) -> bool:
         """Return whether rendering was cancelled or has reached its ``timeout``."""
@@ -414,14 +423,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         with dr.suspend_grad(), self._builder.lock, exclusive(sensor.film()):
             if self._source.depends_on_view:
                 spp = self._source.meet_tolerance(scene, sensor, spp, seed, self.progress)
-            camera_rays = self._prepared(scene)
-            view = scene, sensor, seed, spp
-            if camera_rays is None:
-                film = self._image.render_stock(self._stock.chosen, *view)
-            else:
-                if isinstance(camera_rays, TracedCameraRays):
-                    camera_rays.prepare_view(scene, sensor, spp, self._options.settings.seed)
-                film = self._image.render(camera_rays, *view, self.should_stop)
+            film = self._rendered(scene, sensor, seed, spp)
             image = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)
@@ -429,6 +431,29 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
                 dr.eval()
                 dr.sync_thread()
             return image
+
+    def _rendered(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
+        """Render the film of ``sensor`` with the caches, or with one of Mitsuba's integrators if
+        there are none, or if it is faster.
+        """
+        require_same_variant(self._variant, mi.variant())
+        cheaper = self._source.cheaper_stock_image(scene, sensor, spp)
+        if cheaper is not None:
+            self._source.note_stock_image(cheaper)
+            return self._image.render_instead(self._faster.chosen, scene, sensor, seed, cheaper.spp)
+        camera_rays = self._prepared(scene)
+        if camera_rays is None:
+            return self._image.render_stock(self._stock.chosen, scene, sensor, seed, spp)
+        if isinstance(camera_rays, TracedCameraRays):
+            camera_rays.prepare_view(scene, sensor, spp, self._options.settings.seed)
+        return self._image.render(camera_rays, scene, sensor, seed, spp, self.should_stop)
+
+    def uses_cache(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> bool:
+        """Return whether `render` would use caches, and not Mitsuba's integrators, which can be
+        faster for a single image.
+        """
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        return self._source.cheaper_stock_image(scene, sensor, spp) is None
 
     def progressive(
         self,

@@ -180,13 +180,20 @@ def _with_tolerance(
     return describe_integrator(name, properties | {"tolerance": args.tolerance})
 
 
+def _uses_cache(scene: mi.Scene, args: argparse.Namespace) -> bool:
+    """Return whether an image is rendered with the cache of the integrator, which has one."""
+    uses = getattr(scene.integrator(), "uses_cache", None)
+    return uses is None or uses(scene, args.sensor, args.spp)
+
+
 def _render(
     scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], display: StageDisplay
 ) -> np.ndarray:
     integrator = scene.integrator()
     name = "projection" if has_cache(scene) else "render"
     try:
-        if has_cache(scene) and not args.tolerance:  # which depends on the view
+        # With a tolerance, the cache depends on the view.
+        if has_cache(scene) and not args.tolerance and _uses_cache(scene, args):
             with _kernel_stopwatch(seconds, "cache"), progress_bar(integrator, display):
                 integrator.prepare(scene)
         with _kernel_stopwatch(seconds, name), display.stage("rendering (compiling kernels first)"):

@@ -11,6 +11,7 @@ from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.imaging.options import Options
 from mitsuba_irrcache.imaging.stock import StockIntegrators
+from mitsuba_irrcache.imaging.stock_estimate import StockImage, cheaper_stock_image
 from mitsuba_irrcache.pipeline.builder import Progress
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import CameraRays, ClosedFormCameraRays, TracedCameraRays
@@ -28,11 +29,19 @@ class CameraRaySource:
     Media and caches are those of ``builder``; with the property ``tolerance``, those that the
     search finds for a view; with ``sigma_t_file``, those of the volume in that file. For scenes
     without a visible medium there are no camera rays, and ``stock`` chooses one of Mitsuba's
-    integrators. ``stopping`` ends the construction of a cache early.
+    integrators; for those where one of these is faster, ``faster`` does. ``stopping`` ends the
+    construction of a cache early.
     """
 
-    def __init__(self, options: Options, stopping: StopCondition, stock: StockIntegrators) -> None:
-        self._options, self._stopping, self._stock = options, stopping, stock
+    def __init__(
+        self,
+        options: Options,
+        stopping: StopCondition,
+        stock: StockIntegrators,
+        faster: StockIntegrators,
+    ) -> None:
+        self._options, self._stopping = options, stopping
+        self._stock, self._faster = stock, faster
         self.builder = options.builder(options.settings)
         self._search = options.tolerance_search()
         self._step = options.rays.step  # replaced by the step that the search finds
@@ -49,6 +58,8 @@ class CameraRaySource:
         self.latest: CameraRays | None = None
         self._parts: list[CachedMedium] | None = None  # the media of `latest`
         self._revision = 0  # revision of the builder for which `latest` was created
+        # Paths of images that were rendered without the caches of these media.
+        self._without_caches: tuple[list[CachedMedium] | None, float] = None, 0.0
 
     @property
     def depends_on_view(self) -> bool:
@@ -120,6 +131,39 @@ class CameraRaySource:
                 self._renew(scene)
             return self.latest
 
+    def cheaper_stock_image(
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int
+    ) -> StockImage | None:
+        """Return the image by one of Mitsuba's integrators that is estimated to be faster than to
+        build the caches first; None if none is, if caches exist, or if the user requests them.
+        """
+        builder, stock = self.builder, self._faster
+        if not self._options.may_use_stock or builder.samples:
+            return None
+        with builder.lock, dr.suspend_grad():
+            builder.fit(scene)
+            parts = builder.parts
+            if not parts or builder.carries_gradients or not builder.is_untouched:
+                return None
+            stock.choose(scene)
+            spent = self._without_caches[1] if self._without_caches[0] is parts else 0.0
+            spp = spp or sensor.sampler().sample_count()
+            return cheaper_stock_image(scene, sensor, spp, parts, stock.chosen, spent)
+
+    def note_stock_image(self, image: StockImage) -> None:
+        """Log that ``image`` is rendered without caches, and count its paths: after some such
+        images, caches are estimated to be faster.
+        """
+        parts, (counted, spent) = self.builder.parts, self._without_caches
+        self._without_caches = parts, image.paths + (spent if counted is parts else 0.0)
+        names = " or ".join(sorted({f'"{part.solver.name}"' for part in parts}))
+        mi.Log(
+            mi.LogLevel.Info,
+            f"irrcache: {self._faster.name} renders this image, which is estimated to be faster "
+            f"than to build a cache: {image}. If more images of the scene follow, a cache will be "
+            f"built. Set solver to {names} to build it now.",
+        )
+
     def _begin(self, progress: Progress | None) -> Progress:
         """Start the timeout; return a ``progress`` that raises `Stopped` when it expires."""
         self._stopping.begin(self._options.timeout)
@@ -150,7 +194,12 @@ class CameraRaySource:
         dr.eval()
         self._revision = self.builder.revision
         if self.latest is None:
-            self._stock.choose(scene)
+            reason = self._stock.choose(scene)
+            mi.Log(
+                mi.LogLevel.Info,
+                "irrcache: no medium is visible, so no cache is used: "
+                f"{self._stock.name} renders this scene ({reason}).",
+            )
 
     def _log_what_is_missing(self) -> None:
         done, target = self.builder.done, self.builder.target

@@ -95,6 +95,22 @@ class ImageRenderer:
             self._finish(film, Layers.background_only(mi.Spectrum(*channels)), alpha)
         return film
 
+    def render_instead(
+        self, stock: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int
+    ) -> mi.Film:
+        """Render a scene with a visible medium with Mitsuba's integrator ``stock``.
+
+        The sampler keeps its number of samples, which ``spp`` may exceed.
+        """
+        check_sensor(scene, sensor)
+        sampler = sensor.sampler()
+        requested = sampler.sample_count()
+        try:
+            stock.render(scene, sensor, seed, spp)
+        finally:
+            sampler.set_sample_count(requested)
+        return sensor.film()
+
     def _finish(self, film: mi.Film, layers: Layers, alpha: mi.Float | None) -> None:
         """Filter the layers, compose the image, and record the duration."""
         if self._filter != "none":

@@ -1,4 +1,4 @@
-"""Mitsuba's own integrators, for scenes without a visible medium."""
+"""Mitsuba's own integrators, for scenes without a visible medium, and where they are faster."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ class StockIntegrators:
         self._loaded: dict[str, mi.Integrator] = {}
         self._chosen = "volpath"
 
-    def choose(self, scene: mi.Scene) -> None:
-        """Choose and log the integrator for a scene without a visible medium."""
+    def choose(self, scene: mi.Scene) -> str:
+        """Choose the integrator for a scene; return the reason."""
         self._chosen, reason = choose_stock(scene)
-        mi.Log(
-            mi.LogLevel.Info,
-            f"irrcache: no medium is visible, so no cache is used: {self._chosen} renders this "
-            f"scene ({reason}).",
-        )
+        return reason
+
+    @property
+    def name(self) -> str:
+        """Name of the integrator for the latest scene."""
+        return self._chosen
 
     @property
     def chosen(self) -> mi.Integrator:

@@ -192,6 +192,16 @@ class CacheBuilder:
                 self.close()
 
     @property
+    def is_untouched(self) -> bool:
+        """Whether all caches are empty, and no progressive run is refining them."""
+        return not self._stages and all(p.is_dark or not p.shown.samples for p in self.parts)
+
+    @property
+    def carries_gradients(self) -> bool:
+        """Whether any parameter of the scene carries gradients."""
+        return self._version is not None and self._version.carries_gradients
+
+    @property
     def _wanted(self) -> int:
         """Current target of samples per voxel; 0: the default."""
         return max((stage.samples for stage in self._stages), default=0) or self.samples

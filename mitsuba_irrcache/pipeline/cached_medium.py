@@ -153,6 +153,14 @@ class CachedMedium:
         """Whether there is no cache or it is zero, so that samples have no effect."""
         return self.cache is None or not self.cache.active_count
 
+    @property
+    def cost(self) -> float:
+        """Cost of the empty cache with its default samples, see `Solver.cost`."""
+        if self.is_dark:
+            return 0.0
+        count = self.cache.active_count
+        return self.solver.cost(self.medium, count, self.target(self.settings.samples))
+
     def refine(self, scene: mi.Scene, samples: int, early: bool, progress: Progress | None) -> bool:
         """Fill the cache up to ``samples`` per voxel (0: the default).
 
@@ -270,12 +278,6 @@ class CachedMedium:
             f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {active} "
             f"of {grid.voxel_count} see the medium",
         )
-        if self.medium.refracts and self.solver.finds_refracted_by_chance:
-            mi.Log(
-                mi.LogLevel.Info,
-                f"irrcache: {self.label}behind glass this solver finds emitters by chance, as "
-                "volpath does, which is faster for a single small image.",
-            )
 
     def _direct_lights(
         self,

@@ -91,8 +91,6 @@ class Solver(ABC):
     supports_delta_m: ClassVar[bool] = False
     #: whether gradients of its irradiance are computed, see `gradients`
     has_gradients: ClassVar[bool] = False
-    #: whether it finds emitters behind glass by chance only, as ``volpath`` does
-    finds_refracted_by_chance: ClassVar[bool] = False
 
     @classmethod
     @abstractmethod
@@ -127,6 +125,13 @@ class Solver(ABC):
         cls, medium: MediumGrid, max_depth: int, moments: int, voxels: int, channels: int
     ) -> int:
         """Return how many float32 values per voxel are needed to fill a cache."""
+
+    @classmethod
+    def cost(cls, medium: MediumGrid, active_count: int, samples: int) -> float:
+        """Return the cost of a cache with ``samples`` in each active voxel, in paths of ``volpath``
+        that take the same processor time: a lower estimate, or 0 if ``volpath`` is never faster.
+        """
+        return 0.0
 
     @classmethod
     def voxel_classes(

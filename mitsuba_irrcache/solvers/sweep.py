@@ -42,6 +42,10 @@ DIRECTIONS_IN_UNIFORM_LIGHT = 64
 #: The same among surfaces for a phase function with a forward peak: 128 directions have an error of
 #: 1.5 % under a sky with a wide sun, and 256 one of 0.9 %.
 DIRECTIONS_OF_SHARP_SCATTERING = 256
+#: Cost among surfaces, in paths of ``volpath``: of a cache however small, and of a direction in a
+#: voxel. Measured over ground: 9e5 for 6e6 directions in voxels; behind glass 1e6 to 1.6e7, at
+#: least twice as much.
+FIXED_COST, DIRECTION_COST = 5e5, 0.05
 
 
 @register
@@ -142,6 +146,14 @@ class SweepSolver(Solver):
         sets = channels if sn_solver.swept_together(medium, voxels, moments) else 1
         numbers = 5 + 2 * channels + (0 if once else 5 + 12 * sets + 3 * channels)
         return numbers + moments * (3 * channels + (4 if once else 10) * sets)
+
+    @classmethod
+    def cost(cls, medium: MediumGrid, active_count: int, samples: int) -> float:
+        # An isolated medium takes tenths of a second, not more than a pilot image by ``volpath``.
+        if medium.is_isolated:
+            return 0.0
+        cost = FIXED_COST + DIRECTION_COST * active_count * samples
+        return 2 * cost if medium.refracts else cost
 
     @classmethod
     def voxel_classes(

@@ -46,6 +46,9 @@ LANES = 1 << 21
 #: voxel.
 PATHS, PATHS_AMONG_SURFACES, PATHS_BEHIND_GLASS = 2**24, 2**22, 2**23
 FEWEST_SAMPLES, MOST_SAMPLES = 16, 256
+#: Cost of a path in paths of ``volpath`` through the image: in a room and in clouds, and behind
+#: glass, where paths are longer than those that also miss the medium.
+PATH_COST, PATH_COST_BEHIND_GLASS = 0.7, 1.0
 
 
 @register
@@ -67,7 +70,6 @@ class PathSolver(Solver):
         among_surfaces=SizeAmongSurfaces(32, 64, target_error=0.25),
     )
     has_preview = True
-    finds_refracted_by_chance = True
 
     @classmethod
     def why_not(
@@ -97,6 +99,10 @@ class PathSolver(Solver):
     ) -> int:
         # Sums are in float64.
         return channels * (3 * 2 + 3) + 5 + channels * moments * 3
+
+    @classmethod
+    def cost(cls, medium: MediumGrid, active_count: int, samples: int) -> float:
+        return active_count * samples * (PATH_COST_BEHIND_GLASS if medium.refracts else PATH_COST)
 
     @classmethod
     def voxel_classes(
