@@ -30,8 +30,8 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.progressive import Frame, Targets, frames
 from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.camera import CameraRays, TracedCameraRays
+from mitsuba_irrcache.render.certificate import Certificate
 from mitsuba_irrcache.render.film import check_film, exclusive
-from mitsuba_irrcache.render.tolerance import Certificate
 
 if TYPE_CHECKING:  # most programs compute no gradients: their modules are imported on use
     from mitsuba_irrcache.gradients.backward import ParameterAdjoint

@@ -15,7 +15,7 @@ from mitsuba_irrcache.imaging.stock_estimate import StockImage, cheaper_stock_im
 from mitsuba_irrcache.pipeline.builder import Progress
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import CameraRays, ClosedFormCameraRays, TracedCameraRays
-from mitsuba_irrcache.render.tolerance import Certificate
+from mitsuba_irrcache.render.certificate import Certificate
 from mitsuba_irrcache.scene.consistency import check_sensor
 
 # few volumes stay in files: these modules are imported on use
@@ -105,13 +105,17 @@ class CameraRaySource:
             )
             return spp
         before = self.certificate
-        builder, self._step, spp, self.certificate = found
-        self.builder.adopt(builder)
+        self._step, self.certificate = found.step, found.certificate
+        self.builder.adopt(found.builder)
+        rays = self._options.rays
+        if found.camera_rays is not None and not (rays.layered or rays.with_error):
+            self.latest, self._parts = found.camera_rays, self.builder.parts
+            self._revision = self.builder.revision
         if self.certificate is not before:
             exceeded = self.certificate.parts and not self.certificate.is_met
             level = mi.LogLevel.Warn if exceeded else mi.LogLevel.Info
             mi.Log(level, f"irrcache: {self.certificate}.")
-        return spp
+        return found.spp
 
     def camera_rays(self, scene: mi.Scene, progress: Progress | None) -> CameraRays | None:
         """Return the camera rays for the cache of ``scene``; None if no medium is visible."""

@@ -1,14 +1,15 @@
 """Choose cache, step and samples per pixel such that an image has at most a given error.
 
-The error of an image has independent parts, each of which gets a share of the tolerance. All are
-measured on the image itself, along probe rays that are spread over the film:
+The error of an image has independent parts, whose squares add up. All are measured on the image
+itself, as means over pixels along probe rays that are spread over the film:
 
 - *Voxels*: caches of increasing resolution. If the error is C h^p, where h is the voxel edge, the
   images for h and r h differ by C h^p (r^p - 1). The order p follows from three resolutions
-  (Richardson extrapolation); from two, a low one is assumed.
-- *Directions*, or samples per voxel: the variance between coarse caches with different seeds. With
-  `sweep` all voxels share their ordinates, so that the variance hardly depends on the resolution;
-  with `path` it is larger for coarser caches.
+  (Richardson extrapolation); from two, a low one is assumed. Detail of the data that is smaller
+  than the voxels may be missing in both images, and has an estimate of its own.
+- *Directions*, or samples per voxel: every cache consists of at least two parts of independent
+  samples, whose images differ. The product of the differences that two parts have between two
+  resolutions does not contain their noise.
 - *Steps*: the difference from ray marching with half the step.
 - *Pixels*: the variance between renderings with different seeds, for some pixels of the film.
 
@@ -19,106 +20,78 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import TYPE_CHECKING
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.cancellation import Stopped
-from mitsuba_irrcache.core.jit import Divisor
-from mitsuba_irrcache.core.sequences import kronecker
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings, Progress
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache
-from mitsuba_irrcache.render.camera import CameraRays, ClosedFormCameraRays, TracedCameraRays
-from mitsuba_irrcache.render.film import CameraSampler, PixelPositions, camera_ray
+from mitsuba_irrcache.render.camera import CameraRays, TracedCameraRays
+from mitsuba_irrcache.render.certificate import Certificate
+from mitsuba_irrcache.render.probe_rays import ProbeRays, SampledPixels
+from mitsuba_irrcache.solvers.grid_size import unresolved_error
 
-#: Shares of the tolerance; their squares add up to about 1. Work is in proportion to n^3 N for n
-#: voxels along an axis and N directions; with errors of order n^-p and N^(-1/2) it is least where
-#: the squares of both are in the ratio 3 : 2 p.
+#: Shares of the tolerance. Work is in proportion to n^3 N for n voxels along an axis and N
+#: directions; with errors of order n^-p and N^(-1/2) it is least where the squares of both are in
+#: the ratio 3 : 2 p. What one part leaves of its share is used by those that are fitted after it.
 SHARES = {"voxels": 0.62, "directions": 0.62, "steps": 0.3, "pixels": 0.35}
+#: The least share of the directions.
+LEAST_OF_DIRECTIONS = 0.3
 #: Values of the property ``tolerance_of``.
 SCALES = ("image", "volume")
-#: Rays that are compared, pixels that are sampled, and seeds with which they are.
-RAYS, PIXELS, GROUPS = 1 << 14, 1 << 8, 4
 #: Resolution of the first cache, the ratio between resolutions, and its minimum.
-COARSEST, LARGEST_RATIO, SMALLEST_RATIO = 16, 2.0, 1.4
-#: Order of the error in the voxel edge: assumed if it is not known, and its limits.
-ASSUMED_ORDER, ORDERS = 1.3, (0.8, 2.0)
+COARSEST, LARGEST_RATIO, SMALLEST_RATIO = 8, 2.0, 1.3
+#: Order of the error in the voxel edge: assumed if it is not known, and its limits. Fewer voxels
+#: than FEWEST are too few to estimate it.
+ASSUMED_ORDER, ORDERS, FEWEST = 1.3, (0.8, 1.7), 16
 #: The next resolution is larger by this factor than predicted.
-MARGIN = 1.2
+MARGIN = 1.1
 #: Finest resolution that is tried, unless the data have more voxels along their longest side.
 FINEST = 256
-#: Seeds by which the scatter of a coarse cache is measured.
-SEEDS = 4
-#: Most directions or samples per voxel that are chosen; the order of the error in their number by
-#: which the next one is predicted, between that of random and that of stratified ones; and limits
-#: of its ratio to the one before.
-MOST_SAMPLES, SAMPLE_ORDER, SAMPLE_RATIOS = 1 << 12, 0.7, (1.5, 4.0)
-#: Steps that are tried, from the longest on.
-STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
-#: Order of the error in the step.
-STEP_ORDER = 2
+#: Directions or samples of a part of a cache: of the first cache, and limits.
+FIRST_PART, PARTS = 64, (64, 256)
+#: Ratio of the scatter of fine to that of coarse caches, about; and the number of independent
+#: values, about, in an image's noise due to directions, which all pixels share.
+LESS_SCATTER, INDEPENDENT = 0.4, 10
+#: Scatter of a level, at least, in units of that expected from the level before.
+LEAST_DECREASE = 0.6
+#: Most directions or samples per voxel that are chosen.
+MOST_SAMPLES = 1 << 12
+#: The longest and the shortest step that are tried, and the order of the error in it.
+STEPS, STEP_ORDER = (4.0, 0.25), 2
 #: Samples per pixel that are tried.
 MOST_PIXEL_SAMPLES = 1 << 10
 
 MakeCameraRays = Callable[[CacheBuilder, float], CameraRays]
-if TYPE_CHECKING:  # types of Mitsuba exist once a variant is set
-    Rays = tuple[mi.Ray3f, mi.Spectrum, mi.Medium | None]
 
 
-@dataclass(frozen=True)
-class Certificate:
-    """Estimated error of an image: RMSE over its pixels, in units of the mean radiance.
+@dataclass
+class Found:
+    """Result of a search: the builder of a cache, its camera rays, and settings."""
 
-    Attributes:
-        tolerance: the requested error.
-        tolerance_of: "image", or "volume" if the unit is the mean radiance of the media alone.
-        parts: estimated RMSE by "voxels", "directions", "steps" and "pixels"; parts that do not
-            exist for a scene are 0. Empty if there is no estimate.
-        settings: the chosen "resolution", "cache_spp", "step" and "spp".
-        open_points: errors that the estimate does not include, or why the tolerance is not met.
-    """
-
-    tolerance: float
-    tolerance_of: str
-    parts: dict[str, float]
-    settings: dict[str, float]
-    open_points: tuple[str, ...] = ()
-
-    @property
-    def error(self) -> float:
-        """Return the estimated RMSE of the image in units of the mean radiance; NaN if unknown."""
-        if not self.parts:
-            return float("nan")
-        return float(np.sqrt(sum(part**2 for part in self.parts.values())))
-
-    @property
-    def is_met(self) -> bool:
-        """Whether the estimated error is at most the tolerance; False without an estimate."""
-        return self.error <= self.tolerance
-
-    def __str__(self) -> str:
-        parts = ", ".join(f"{name} {100 * value:.2g} %" for name, value in self.parts.items())
-        settings = ", ".join(f"{name} {value:g}" for name, value in self.settings.items())
-        if not self.parts:
-            return "; ".join((*self.open_points, settings))
-        text = (
-            f"error {100 * self.error:.2g} % of the mean radiance of the {self.tolerance_of} "
-            f"({parts}), tolerance {100 * self.tolerance:.2g} %: {settings}"
-        )
-        return "; ".join((text, *self.open_points))
+    builder: CacheBuilder
+    camera_rays: CameraRays | None
+    step: float
+    spp: int
+    certificate: Certificate
 
 
 class Level:
-    """A cache of one resolution, with its camera rays by step."""
+    """A cache of one resolution, and images of the probe rays for it."""
 
     def __init__(self, resolution: int, builder: CacheBuilder, make: MakeCameraRays) -> None:
         self.resolution, self.builder, self._make = resolution, builder, make
-        #: radiance (ray, channel) along the probe rays
-        self.radiance = np.zeros((0, 1))
+        #: radiance (pixel, channel) for the whole cache, and for its first part alone
+        self.radiance = self.first = np.zeros((0, 1))
+        #: samples of a part
+        self.part = 0
+        #: standard error due to the directions, in units of the mean; for later views of a cache
+        #: that of the first one. None: not measured yet
+        self.scatter: float | None = None
+        #: ratio of the noise-free difference from the coarser level to that with noise, likewise
+        self.noise_free: float | None = None
         self._camera_rays: dict[float, CameraRays] = {}
         self._revision = -1
 
@@ -129,6 +102,15 @@ class Level:
         if step not in self._camera_rays:
             self._camera_rays[step] = self._make(self.builder, step)
         return self._camera_rays[step]
+
+    def reset(self, samples: int) -> None:
+        """Forget what was measured for another scene."""
+        self.builder.samples, self.scatter, self.noise_free = samples, None, None
+
+    def error_of_detail(self) -> float:
+        """Return the estimated error due to detail of the data that the voxels do not resolve."""
+        parts = [part for part in self.builder.parts if part.cache is not None]
+        return max((unresolved_error(p.medium, p.cache.grid) for p in parts), default=0.0)
 
 
 class ToleranceSearch:
@@ -153,14 +135,10 @@ class ToleranceSearch:
         self._settings, self._step = settings, step
         self._new_builder, self._camera_rays = new_builder, camera_rays
         self._levels: list[Level] = []
-        self._samples = settings.samples
         self._notes: list[str] = []
         self._view: tuple = ()  # what the last result was found for
-        self._found: tuple | None = None
-
-    def share(self, part: str) -> float:
-        """Return the largest error of a part of the estimate."""
-        return SHARES[part] * self.tolerance
+        self._found: Found | None = None
+        self.is_stopped = False  # whether the time did not suffice
 
     @property
     def finest(self) -> CacheBuilder | None:
@@ -169,87 +147,94 @@ class ToleranceSearch:
 
     def find(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int, progress: Progress | None
-    ) -> tuple[CacheBuilder, float, int, Certificate]:
-        """Return the builder of a cache, a step and the samples per pixel with which the image of
-        ``sensor`` meets the tolerance, as far as the limits permit; and the estimate of its error.
+    ) -> Found:
+        """Return the cache, the step and the samples per pixel with which the image of ``sensor``
+        meets the tolerance, as far as the limits permit; and the estimate of its error.
 
         ``spp`` is 0, or the number of samples per pixel to be used.
         """
-        rays = _probe_rays(sensor)
+        rays = ProbeRays(sensor)
         self._begin(scene, progress)
-        view = spp, *_values_of(rays)
+        view = spp, *rays.identity
         if view != self._view:
-            self._view, self._notes = (), []
-            self._found = self._search(scene, sensor, rays, (spp, seed), progress)
-            self._view = view
+            self._view, self._notes, self.is_stopped = (), [], False
+            pixels = SampledPixels(scene, sensor, seed)
+            self._found = self._search(scene, sensor, rays, pixels, spp, progress)
+            # The next rendering continues a search that was stopped.
+            self._view = () if self.is_stopped else view
         return self._found
 
     def _search(
         self,
         scene: mi.Scene,
         sensor: mi.Sensor,
-        rays: Rays,
-        samples: tuple[int, int],
+        rays: ProbeRays,
+        pixels: SampledPixels,
+        spp: int,
         progress: Progress | None,
-    ) -> tuple[CacheBuilder, float, int, Certificate]:
-        """Return the result of `find` for a view, given by its probe ``rays``; ``samples`` are the
-        number of samples per pixel and their seed.
-        """
-        spp, seed = samples
-        first = self._levels[0]
+    ) -> Found:
+        """Return the result of `find` for a view."""
         closed = self._closed_form(scene)
         if closed is not None:
-            return self._without_cache(scene, sensor, spp, seed, closed, progress)
-        mean = self._mean(scene, sensor, seed)
-        for level in self._levels:
-            level.radiance = self._probe(scene, level, rays)
+            return self._without_cache(scene, sensor, spp, closed, progress)
+        first = self._levels[0]
+        mean = pixels.mean(first.camera_rays(self._step or 1.0), self._of == "volume")
+        if not mean > 0:
+            raise IrrcacheError(
+                f"irrcache: the {self._of} has no radiance in the view of the sensor, so there is "
+                "no unit for its tolerance; set resolution instead of tolerance."
+            )
+        fit = _CacheFit(self, scene, rays, mean, progress)
         parts = {"voxels": 0.0, "directions": 0.0}
-        if not first.builder.is_dark:
-            parts["directions"] = self._fit_samples(scene, rays, mean, progress)
-            parts["voxels"] = self._fit_resolution(scene, rays, mean, progress)
+        if first.builder.is_dark:
+            first.radiance = fit.probe(first)
+        else:
+            parts["voxels"] = fit.refine_voxels()
         last = self._levels[-1]
-        step, parts["steps"] = self._fit_step(scene, last, rays, mean)
+        step, parts["steps"] = self._fit_step(last, fit)
+        if not first.builder.is_dark:
+            parts["directions"] = fit.refine_directions(parts)
         camera_rays = last.camera_rays(step)
-        spp, parts["pixels"] = self._fit_pixels(scene, sensor, camera_rays, spp, seed, mean)
+        spp, parts["pixels"] = self._fit_pixels(
+            sensor, scene, pixels, camera_rays, spp, parts, mean
+        )
         if isinstance(camera_rays, TracedCameraRays):
             self._notes.append("the irradiance of surfaces is not part of the estimate")
-        found = {"resolution": last.resolution, "cache_spp": last.builder.done}
-        found |= {"step": step, "spp": spp}
-        certificate = Certificate(self.tolerance, self._of, parts, found, tuple(self._notes))
-        return last.builder, step, spp, certificate
+        settings = {"resolution": last.resolution, "cache_spp": last.builder.done}
+        settings |= {"step": step, "spp": spp}
+        certificate = Certificate(self.tolerance, self._of, parts, settings, tuple(self._notes))
+        return Found(last.builder, camera_rays, step, spp, certificate)
+
+    def share(self, part: str) -> float:
+        """Return the largest error of a part of the estimate."""
+        return SHARES[part] * self.tolerance
+
+    def rest(self, *errors: float) -> float:
+        """Return what other ``errors`` leave of the tolerance."""
+        return float(np.sqrt(max(0.99 * self.tolerance**2 - np.square(errors).sum(), 0)))
 
     # Caches
 
     def _begin(self, scene: mi.Scene, progress: Progress | None) -> None:
         """Bring the coarsest cache up to date; discard all others if the scene has changed."""
+        resolution = self._settings.resolution
         if not self._levels:
-            self._levels = [self._level(self._settings.resolution or COARSEST)]
+            self._levels = [self.level(max(resolution // 2, 1) if resolution else COARSEST)]
         first = self._levels[0].builder
         before = first.revision
         first.fit(scene)
         if first.revision != before:
             del self._levels[1:]
+            self._levels[0].reset(first.settings.samples)
             self._view = ()
-            self._samples = first.samples = self._settings.samples
         first.update(scene, progress)
 
-    def _level(self, resolution: int, seed: int = 0) -> Level:
-        """Return a level whose cache is empty."""
-        settings = replace(
-            self._settings,
-            resolution=resolution,
-            seed=self._settings.seed + seed,
-            samples=self._samples,
-            file="",
-        )
+    def level(self, resolution: int, samples: int = FIRST_PART) -> Level:
+        """Return a level whose cache is empty, and has this number of samples in its first part."""
+        given = self._settings.samples
+        samples = -(-given // 2) if given else samples
+        settings = replace(self._settings, resolution=resolution, samples=samples, file="")
         return Level(resolution, self._new_builder(settings), self._camera_rays)
-
-    def _built(
-        self, scene: mi.Scene, resolution: int, seed: int, progress: Progress | None
-    ) -> Level:
-        level = self._level(resolution, seed)
-        level.builder.update(scene, progress)
-        return level
 
     def _closed_form(self, scene: mi.Scene) -> str | None:
         """Return why no cache is needed; None if one is."""
@@ -261,87 +246,173 @@ class ToleranceSearch:
         return needs_no_cache(scene, builder.medium, depth, self._settings.resolution)
 
     def _without_cache(
-        self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        spp: int,
-        seed: int,
-        reason: str,
-        progress: Progress | None,
-    ) -> tuple[CacheBuilder, float, int, Certificate]:
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, reason: str, progress: Progress | None
+    ) -> Found:
         """Return the result of `find` for a scene without a cache."""
         builder = self._new_builder(replace(self._settings, file=""))
         builder.update(scene, progress)
         step = self._step or 1.0
         spp = spp or sensor.sampler().sample_count()
-        found = {"step": step, "spp": spp}
-        notes = (f"no estimate, since {reason}",)
-        return builder, step, spp, Certificate(self.tolerance, self._of, {}, found, notes)
+        settings, notes = {"step": step, "spp": spp}, (f"no estimate, since {reason}",)
+        certificate = Certificate(self.tolerance, self._of, {}, settings, notes)
+        return Found(builder, None, step, spp, certificate)
 
-    def _fit_samples(
-        self, scene: mi.Scene, rays: Rays, mean: float, progress: Progress | None
-    ) -> float:
-        """Choose the samples per voxel from the scatter of coarse caches; return the error."""
-        if len(self._levels) > 1:
-            return self._direction_error  # of another view, with the same ordinates
-        wanted, most = self.share("directions"), MOST_SAMPLES
+    # March
+
+    def _fit_step(self, level: Level, fit: _CacheFit) -> tuple[float, float]:
+        """Choose the longest step whose error has its share; return both."""
+        images = {1.0: level.radiance} if self._step is None else {self._step: level.radiance}
+
+        def error(step: float) -> float:
+            for each in (step, step / 2):
+                if each not in images:
+                    images[each] = fit.probe(level, each)
+            difference = _rms(images[step] - images[step / 2])
+            return difference / fit.mean / (1 - 2.0**-STEP_ORDER)
+
+        if self._step is not None:
+            return self._step, error(self._step)
+        step, largest = 2.0, self.share("steps")
+        found = error(step)
+        while found > largest and step > STEPS[1]:
+            step /= 2
+            found = error(step)
+        while step >= 2 and step < STEPS[0]:
+            longer = error(2 * step)
+            if longer > largest:
+                break
+            step, found = 2 * step, longer
+        return step, found
+
+    # Pixels
+
+    def _fit_pixels(
+        self,
+        sensor: mi.Sensor,
+        scene: mi.Scene,
+        pixels: SampledPixels,
+        camera_rays: CameraRays,
+        spp: int,
+        parts: dict[str, float],
+        mean: float,
+    ) -> tuple[int, float]:
+        """Choose the samples per pixel, unless ``spp`` is given; return their number and error."""
+        largest = max(self.rest(*parts.values()), self.share("pixels"))
+        tried = pixels.rounded(spp or sensor.sampler().sample_count())
         while True:
-            error, used = self._scatter(scene, rays, mean, progress), self._levels[0].builder.done
-            self._direction_error = error
-            if self._settings.samples or error <= wanted:
-                return error
-            if used >= most:
-                self._notes.append(f"more than {used} samples per voxel were not tried")
-                return error
-            ratio = np.clip((error / wanted) ** (1 / SAMPLE_ORDER), *SAMPLE_RATIOS)
-            self._samples = min(int(np.ceil(used * ratio)), most)
-            # The batches of a cache depend on the number of its samples.
-            resolution = self._levels[0].resolution
-            self._levels = [self._built(scene, resolution, 0, progress)]
-            self._levels[0].radiance = self._probe(scene, self._levels[0], rays)
+            if isinstance(camera_rays, TracedCameraRays):
+                camera_rays.prepare_view(scene, sensor, tried, self._settings.seed)
+            error = pixels.standard_error(camera_rays, tried) / mean
+            if spp or error <= largest:
+                return tried, error
+            if tried >= MOST_PIXEL_SAMPLES:
+                self._notes.append(f"more than {tried} samples per pixel were not tried")
+                return tried, error
+            wanted = tried * (error / largest) ** 2
+            tried = int(2 ** np.ceil(np.log2(np.clip(wanted, 2 * tried, 8 * tried))))
+            tried = pixels.rounded(min(tried, MOST_PIXEL_SAMPLES))
 
-    def _scatter(
-        self, scene: mi.Scene, rays: Rays, mean: float, progress: Progress | None
-    ) -> float:
-        """Return the standard error of an image due to the directions, from other seeds."""
-        # docs/primer, eq. (7.4)
-        first = self._levels[0]
-        images = [first.radiance]
-        for seed in range(1, SEEDS):
-            level = self._built(scene, first.resolution, seed, progress)
-            images.append(self._probe(scene, level, rays))
-        return float(np.sqrt(np.var(images, axis=0, ddof=1).mean())) / mean
 
-    def _fit_resolution(
-        self, scene: mi.Scene, rays: Rays, mean: float, progress: Progress | None
-    ) -> float:
-        """Add finer caches until the error of the voxels has its share; return it."""
-        wanted = self.share("voxels")
+class _CacheFit:
+    """Refines the caches of a ``search`` for a view, given by its probe rays."""
+
+    def __init__(
+        self,
+        search: ToleranceSearch,
+        scene: mi.Scene,
+        rays: ProbeRays,
+        mean: float,
+        progress: Progress | None,
+    ) -> None:
+        self._search, self._scene, self._rays = search, scene, rays
+        self.mean, self._progress = mean, progress
+        self._levels, self._settings = search._levels, search._settings
+        self._notes = search._notes
+
+    def refine_voxels(self) -> float:
+        """Add finer caches until the error of the voxels is within its limit; return it."""
+        for level in self._levels:
+            self._complete(level)
         if self._settings.resolution:
-            coarse = self._built(scene, max(self._settings.resolution // 2, 1), 0, progress)
-            coarse.radiance = self._probe(scene, coarse, rays)
-            return self._error([coarse, self._levels[0]], mean)
+            if len(self._levels) == 1:
+                self._add(self._settings.resolution)
+        else:
+            self._add_levels()
+        return self._error_of_voxels(self._levels)
+
+    def probe(self, level: Level, step: float | None = None) -> np.ndarray:
+        """Return the radiance (pixel, channel) of the media along the probe rays."""
+        step = step or self._search._step or 1.0
+        return self._rays.radiance(self._scene, level.camera_rays(step))
+
+    def _stop(self, what: str) -> None:
+        """Note for ``what`` the time did not suffice."""
+        self._search.is_stopped = True
+        self._notes.append(f"the time did not suffice {what}")
+
+    def _add(self, resolution: int, samples: int = FIRST_PART) -> None:
+        """Add a level of another resolution."""
+        level = self._search.level(resolution, samples)
+        level.builder.update(self._scene, self._progress)
+        self._complete(level)
+        # Parts of few directions may differ less than usual by chance.
+        before = self._levels[-1]
+        expected = before.scatter * np.sqrt(before.builder.done / level.builder.done)
+        level.scatter = max(level.scatter, LEAST_DECREASE * float(expected))
+        self._levels.append(level)
+
+    def _complete(self, level: Level) -> None:
+        """Fill a level to at least two parts, and measure its images along the probe rays."""
+        builder = level.builder
+        if level.scatter is not None:  # of another view
+            level.radiance = level.first = self.probe(level)
+            return
+        level.first, level.part = self.probe(level), builder.done
+        builder.samples = 2 * level.part
+        # docs/primer, eq. (7.4)
+        builder.update(self._scene, self._progress)
+        level.radiance = self.probe(level)
+        level.scatter = _rms(level.radiance - level.first) / self.mean
+
+    # Voxels
+
+    def _add_levels(self) -> None:
+        """Add finer levels until the error of the voxels is within its limit, or others end it."""
         while True:
-            error = self._error(self._levels, mean)
-            if error <= wanted:
-                return error
-            if len(self._levels) > 2 and error > self._error(self._levels[:-1], mean):
+            error = self._error_of_voxels(self._levels)
+            if self._is_fine_enough(error):
+                return
+            earlier = [self._error_of_voxels(self._levels[:-n]) for n in (1, 2)]
+            if len(self._levels) > 4 and error > max(earlier):
                 self._notes.append("the error does not decrease with the resolution")
-                return error
-            resolution = self._next_resolution(error / wanted)
+                return
+            resolution = self._next_resolution(error / self._search.share("voxels"))
             if resolution > self._finest:
                 self._notes.append(f"resolutions above {self._finest} were not tried")
-                return error
+                return
             try:
-                level = self._built(scene, resolution, 0, progress)
+                self._add(resolution, self._size_of_parts())
             except Stopped:
-                self._notes.append(f"the time did not suffice for resolution {resolution}")
-                return error
+                self._stop(f"for resolution {resolution}")
+                return
             except IrrcacheError as problem:
                 self._notes.append(f"resolution {resolution} is not possible: {problem}")
-                return error
-            level.radiance = self._probe(scene, level, rays)
-            self._levels.append(level)
+                return
+
+    def _is_fine_enough(self, error: float) -> bool:
+        """Return whether no finer voxels are needed: their ``error`` is within its share, or it is
+        cheaper to reduce that of the directions instead.
+        """
+        last, search = self._levels[-1], self._search
+        if error <= search.share("voxels"):
+            return True
+        rest = search.rest(error, search.share("steps"), search.share("pixels"))
+        if rest < LEAST_OF_DIRECTIONS * search.tolerance:
+            return False
+        # Work in units of that for the last level.
+        more_directions = max((last.scatter / rest) ** 2 - 1, 0.0)
+        finer = self._next_resolution(error / search.share("voxels")) / last.resolution
+        return more_directions <= finer**3 * (last.scatter / search.share("directions")) ** 2
 
     @property
     def _finest(self) -> int:
@@ -357,170 +428,90 @@ class ToleranceSearch:
             ratio = MARGIN * excess ** (1 / self._order(self._levels))
         return int(np.ceil(last * np.clip(ratio, SMALLEST_RATIO, LARGEST_RATIO)))
 
+    def _difference(self, coarse: Level, fine: Level) -> float:
+        """Return the RMS difference of the images of two levels without their noise.
+
+        The differences that two independent parts have between the levels contain independent
+        noise, so that it vanishes in their product.
+        """
+        whole = fine.radiance - coarse.radiance
+        if fine.noise_free is None:
+            first = fine.first - coarse.first
+            second = 2 * whole - first
+            noise = np.square(first - second).mean() / 4  # variance of the mean of both
+            product = max(float(np.mean(first * second)), 0.0) + noise / INDEPENDENT**0.5
+            fine.noise_free = min(float(np.sqrt(product)) / max(_rms(whole), 1e-30), 1.0)
+        return fine.noise_free * _rms(whole)
+
     def _order(self, levels: list[Level]) -> float:
         """Estimate the order of the error in the voxel edge from the last three levels."""
         # docs/primer, eq. (7.3)
-        if len(levels) < 3:
+        if len(levels) < 3 or levels[-3].resolution < FEWEST:
             return ASSUMED_ORDER
         a, b, c = levels[-3:]
-        coarse, fine = _rms(a.radiance - b.radiance), _rms(b.radiance - c.radiance)
+        coarse, fine = self._difference(a, b), self._difference(b, c)
         orders = np.linspace(*ORDERS, 61)
         # I(h) - I(r h) is in proportion to (r^p - 1) h^p.
         u, v = b.resolution / a.resolution, c.resolution / b.resolution
         ratios = (u**orders - 1) * v**orders / (v**orders - 1)
         return float(orders[np.abs(ratios - coarse / max(fine, 1e-30)).argmin()])
 
-    def _error(self, levels: list[Level], mean: float) -> float:
+    def _error_of_voxels(self, levels: list[Level]) -> float:
         """Estimate the error of the finest level due to its voxels."""
         if len(levels) < 2:
             return float("inf")
         coarse, fine = levels[-2:]
         ratio = fine.resolution / coarse.resolution
-        difference = _rms(fine.radiance - coarse.radiance) / mean
-        return difference / (ratio ** self._order(levels) - 1)
+        if ratio == 1:
+            return float("inf")
+        difference = self._difference(coarse, fine) / self.mean
+        return max(difference / (ratio ** self._order(levels) - 1), fine.error_of_detail())
 
-    # March
+    # Directions
 
-    def _fit_step(
-        self, scene: mi.Scene, level: Level, rays: Rays, mean: float
-    ) -> tuple[float, float]:
-        """Choose the longest step whose error has its share; return both."""
-        steps = STEPS if self._step is None else (self._step, self._step / 2)
-        error, chosen = float("inf"), steps[0]
-        before = self._probe(scene, level, rays, steps[0])
-        for step, half in pairwise(steps):
-            after = self._probe(scene, level, rays, half)
-            error = _rms(before - after) / mean / (1 - 2.0**-STEP_ORDER)
-            chosen, before = step, after
-            if error <= self.share("steps"):
+    def _size_of_parts(self) -> int:
+        """Return the samples of a part of the next level's cache: half of those that its share of
+        the error is predicted to need.
+
+        It is the same for all levels but the first ones: their noise is then similar, and hardly
+        contained in their differences.
+        """
+        last = self._levels[-1]
+        if len(self._levels) < 2:
+            return FIRST_PART
+        if len(self._levels) > 2:
+            return last.part
+        excess = LESS_SCATTER * last.scatter / self._search.share("directions")
+        needed = max(last.builder.done * excess**2, 1.0)
+        return int(2 ** np.round(np.log2(np.clip(needed / 2, *PARTS))))
+
+    def refine_directions(self, others: dict[str, float]) -> float:
+        """Add parts to the finest cache until the error of the directions is at most what the
+        ``others`` leave of the tolerance; return it.
+        """
+        last, search = self._levels[-1], self._search
+        rest = search.rest(others["voxels"], others["steps"], search.share("pixels"))
+        largest = max(rest, LEAST_OF_DIRECTIONS * search.tolerance)
+        while not self._settings.samples and last.scatter > largest:
+            done = last.builder.done
+            if done >= MOST_SAMPLES:
+                self._notes.append(f"more than {done} samples per voxel were not tried")
                 break
-        return chosen, error
-
-    def _probe(
-        self, scene: mi.Scene, level: Level, rays: Rays, step: float | None = None
-    ) -> np.ndarray:
-        """Return the radiance (ray, channel) of the media along the probe rays."""
-        camera_rays = level.camera_rays(step or self._step or 1.0)
-        ray, weight, medium = rays
-        found = camera_rays.sample(scene, _Middle(), mi.Ray3f(ray), medium, mi.Bool(True))
-        radiance = found.scattered
-        if isinstance(camera_rays, ClosedFormCameraRays):
-            radiance = radiance + found.background
-        return np.array(mi.Spectrum(radiance * weight), dtype=np.float64).T
-
-    # Pixels
-
-    def _mean(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> float:
-        """Return the mean radiance to which errors are relative."""
-        camera_rays = self._levels[0].camera_rays(self._step or 1.0)
-        samples = _pixel_samples(scene, sensor, camera_rays, 1, seed, self._of == "volume")
-        mean = float(samples.mean())
-        if not mean > 0:
-            raise IrrcacheError(
-                f"irrcache: the {self._of} has no radiance in the view of the sensor, so there is "
-                "no unit for its tolerance; set resolution instead of tolerance."
-            )
-        return mean
-
-    def _fit_pixels(
-        self,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        camera_rays: CameraRays,
-        spp: int,
-        seed: int,
-        mean: float,
-    ) -> tuple[int, float]:
-        """Choose the samples per pixel, unless ``spp`` is given; return their number and error."""
-        tried = _rounded(sensor, spp or sensor.sampler().sample_count())
-        while True:
-            samples = _pixel_samples(scene, sensor, camera_rays, tried, seed, False)
-            error = float(np.sqrt(samples.var(axis=0, ddof=1).mean())) / mean
-            if spp or error <= self.share("pixels"):
-                return tried, error
-            if tried >= MOST_PIXEL_SAMPLES:
-                self._notes.append(f"more than {tried} samples per pixel were not tried")
-                return tried, error
-            wanted = tried * (error / self.share("pixels")) ** 2
-            tried = int(2 ** np.ceil(np.log2(np.clip(wanted, 2 * tried, 8 * tried))))
-            tried = _rounded(sensor, min(tried, MOST_PIXEL_SAMPLES))
-
-
-class _Middle:
-    """A sampler that always returns 0.5, so that images of two caches can be compared."""
-
-    def next_1d(self, active: mi.Bool = True) -> mi.Float:
-        return mi.Float(0.5)
-
-    def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
-        return mi.Point2f(0.5)
-
-
-def _probe_rays(sensor: mi.Sensor) -> Rays:
-    """Return rays spread over the film, their weights, and the sensor's medium."""
-    film = sensor.film()
-    count = min(RAYS, 4 * int(np.prod(film.crop_size())))
-    place = mi.Point2f(kronecker(dr.arange(mi.UInt32, count), 2, (mi.Float(0.5),) * 2))
-    position = place * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
-    ray, weight = camera_ray(sensor, _Middle(), position)
-    dr.eval(ray, weight)
-    return ray, weight, sensor.get_medium()
-
-
-def _pixel_samples(
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    camera_rays: CameraRays,
-    spp: int,
-    seed: int,
-    of_volume: bool,
-) -> np.ndarray:
-    """Return means of ``spp`` samples (group, pixel, channel) in pixels spread over the film.
-
-    The groups have different seeds.
-    """
-    spp = _rounded(sensor, spp)
-    film, medium = sensor.film(), sensor.get_medium()
-    width, height = (int(n) for n in film.crop_size())
-    pixels = min(PIXELS, width * height)
-    lane, sample = Divisor(spp).split(dr.arange(mi.UInt32, pixels * spp))
-    place = kronecker(lane, 2, (mi.Float(0.5),) * 2)
-    x, y = (mi.UInt32(u * n) for u, n in zip(place, (width, height), strict=True))
-    corner = mi.Vector2f(mi.Float(x), mi.Float(y)) + mi.Vector2f(film.crop_offset())
-    found = []
-    for group in range(GROUPS):
-        sampler = _sampler(sensor, spp)
-        sampler.set_samples_per_wavefront(spp)
-        sampler.seed(seed + group, pixels * spp)
-        spread = PixelPositions(sampler, seed + group, spp)
-        position = corner + spread.next(y * width + x, sample)
-        ray, weight = camera_ray(sensor, sampler, position)
-        chosen = CameraSampler(sampler, lambda s=sampler: s.next_2d())
-        result = camera_rays.sample(scene, chosen, mi.Ray3f(ray), medium, mi.Bool(True))
-        radiance = result.scattered if of_volume else result.scattered + result.background
-        radiance = mi.Spectrum(radiance * weight) + dr.zeros(mi.Float, pixels * spp)
-        dr.eval(radiance)
-        found.append([np.array(dr.block_sum(c, spp), dtype=np.float64) / spp for c in radiance])
-    return np.moveaxis(np.array(found), 1, 2)
-
-
-def _rounded(sensor: mi.Sensor, spp: int) -> int:
-    """Return the samples per pixel that the sensor's sampler uses for ``spp``."""
-    return _sampler(sensor, spp).sample_count()
-
-
-def _sampler(sensor: mi.Sensor, spp: int) -> mi.Sampler:
-    """Return a copy of the sensor's sampler for ``spp`` samples per pixel."""
-    sampler = sensor.sampler().clone()
-    sampler.set_sample_count(spp)
-    return sampler
-
-
-def _values_of(rays: Rays) -> tuple:
-    """Return the values of rays that identify them, to detect a change of the sensor."""
-    ray, weight, medium = rays
-    arrays = mi.Vector3f(ray.o), mi.Vector3f(ray.d), ray.time, mi.Spectrum(weight)
-    return (*(np.array(a).tobytes() for a in arrays), medium)
+            wanted = done * (last.scatter / largest) ** 2
+            last.builder.samples = int(min(np.clip(wanted, 1.2 * done, 8 * done), MOST_SAMPLES))
+            try:
+                last.builder.update(self._scene, self._progress)
+            except Stopped:
+                self._stop("for more samples per voxel")
+                break
+            now = last.builder.done
+            if now == done:
+                break
+            before, last.radiance = last.radiance, self.probe(last)
+            # The mean of all parts differs from that of the first m of n by sqrt(1 / m - 1 / n).
+            change = _rms(last.radiance - before) / self.mean / np.sqrt(1 / done - 1 / now)
+            last.scatter = float(np.sqrt(0.5 * (last.scatter**2 * done + change**2) / now))
+        return last.scatter
 
 
 def _rms(values: np.ndarray) -> float:

@@ -245,6 +245,19 @@ def _lost_detail(medium: MediumGrid, sides: np.ndarray) -> float:
     return float(np.sqrt(max(ratios, default=0.0)))
 
 
+def unresolved_error(medium: MediumGrid, grid: Grid) -> float:
+    """Estimate the error of an image, in units of its mean, due to detail of a medium's data that
+    is lost between the voxels of ``grid``.
+
+    It holds in smooth light; see `SMOOTH_ERROR`.
+    """
+    if medium.sigma_t.grid is None:
+        return 0.0
+    edge = _colliding_extinction(medium) * grid.voxel_size.max()
+    error = DEPTH_ERROR * edge + DETAIL_ERROR * min(edge, MOST_DETAIL_DEPTH)
+    return _lost_detail(medium, np.array(grid.resolution)) * error / 100
+
+
 def _colliding_extinction(medium: MediumGrid) -> float:
     """Return the mean extinction over collisions in uniform radiance, int sigma_t^2 / int sigma_t
     [1/scene unit].

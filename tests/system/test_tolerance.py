@@ -29,13 +29,14 @@ def true_error(case: Case, scene: mi.Scene) -> float:
 
 @pytest.mark.parametrize("name", ["constant", "directional", "point outside"])
 def test_the_error_is_below_the_tolerance(mono, name):
-    """The estimate is no smaller than the truth, and at most three times as large."""
+    """The estimate is at most twice the truth, and not much smaller."""
     case = Case(name)
     scene = case.scene(tolerance=TOLERANCE)
     error = true_error(case, scene)
     certificate = scene.integrator().certificate
     assert certificate.is_met
-    assert error < certificate.error < 3 * error
+    assert error <= TOLERANCE
+    assert error / 1.5 < certificate.error < 2 * error
     settings = certificate.settings
     assert scene.integrator().cache.samples == settings["cache_spp"]
     assert max(scene.integrator().cache.grid.shape) == settings["resolution"]
@@ -119,7 +120,8 @@ def test_a_search_that_is_stopped_leaves_its_finest_cache(mono):
     integrator = scene.integrator()
     stopping_after(integrator, len(calls) - 1)
     image = np.array(mi.render(scene))
-    assert integrator.certificate is None
+    assert not integrator.certificate.is_met
+    assert "the time did not suffice for resolution" in str(integrator.certificate)
     assert 16 <= max(integrator.cache.grid.shape) < resolution
     assert integrator.cache.samples > 0
     assert image.mean() == pytest.approx(expected.mean(), rel=0.1)

@@ -106,15 +106,15 @@ SURFACES = (
     Mutant(
         "the error of the voxels is the difference of two resolutions",
         "render/tolerance.py",
-        "return difference / (ratio ** self._order(levels) - 1)",
-        "return difference / 8",
+        "difference / (ratio ** self._order(levels) - 1)",
+        "difference / 8",
         (TOLERANCE,),
     ),
     Mutant(
         "the directions have no error",
         "render/tolerance.py",
-        "            self._direction_error = error\n",
-        "            self._direction_error = error = 0.0\n",
+        "        return last.scatter\n",
+        "        return 0.0\n",
         (TOLERANCE,),
     ),
     Mutant(
@@ -126,7 +126,7 @@ SURFACES = (
     ),
     Mutant(
         "the error of a tolerance has one part only",
-        "render/tolerance.py",
+        "render/certificate.py",
         "sum(part**2 for part in self.parts.values())",
         "max(part**2 for part in list(self.parts.values())[-1:])",
         (TOLERANCE,),

@@ -178,8 +178,17 @@ class Case:
         along = values.mean(axis=0)
         return np.float32(values * (self.depth / self.edges[2] / along[along > 0].mean()))
 
+    @property
+    def properties(self) -> dict:
+        """Return the properties of the integrator that affect the image."""
+        return {"max_depth": self.max_depth, "hide_emitters": True}
+
     def scene(self, **integrator) -> mi.Scene:
         """Load the scene with a cold cache."""
+        return mi.load_dict(self.build({"type": "irrcache"} | self.properties | integrator))
+
+    def build(self, integrator: dict) -> dict:
+        """Return the dictionary for `mi.load_dict`."""
         transform = mi.ScalarTransform4f
         place = transform().scale([e / 2 for e in self.edges])
         unit = place @ transform().translate(-1).scale(2)
@@ -192,12 +201,10 @@ class Case:
         kind, *g = self.phase.split()
         phase = {"type": kind} | ({"g": float(g[0])} if g else {})
         medium = {"type": "heterogeneous", "sigma_t": volume(sigma_t), "albedo": self.albedo}
-        settings = {"max_depth": self.max_depth, "hide_emitters": True}
-        if self.emits:
-            settings["emission"] = volume(0.3 * sigma_t)
+        emission = {"emission": volume(0.3 * sigma_t)} if self.emits else {}
         scene = {
             "type": "scene",
-            "integrator": {"type": "irrcache"} | settings | integrator,
+            "integrator": emission | integrator,
             "sensor": {
                 "type": "perspective", "fov": 34.0,
                 "to_world": transform().look_at([1.7, 1.4, -4.2], [0, 0, 0], [0, 1, 0]),
@@ -219,7 +226,7 @@ class Case:
                 "type": "rectangle", "to_world": below,
                 "bsdf": {"type": "diffuse", "reflectance": 0.5},
             }  # fmt: skip
-        return mi.load_dict(scene)
+        return scene
 
 
 def cases() -> list[Case]:
