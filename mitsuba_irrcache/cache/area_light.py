@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_direct_light
-from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, mean_over, spread
+from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, mean_over, shift_at, spread
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
 from mitsuba_irrcache.core.spectrum import channel_mean
@@ -60,8 +60,15 @@ POSITIONS = 64
 MOST_LIGHTS, MOST_VALUES, VALUES = 8, 14 << 24, 14
 
 #: Lines from a position to an emitter whose lengths in the medium divide optical depths: that to
-#: the closest point, those to several points, or none.
-CLOSEST, SEVERAL, NONE = LINES = ("closest", "several", "none")
+#: the closest point, those to several points, or none. With "each", transmittances of the mean
+#: extinction are averaged over points instead (docs/primer, eq. (2.12)).
+CLOSEST, SEVERAL, NONE, EACH = LINES = ("closest", "several", "none", "each")
+#: Relative error of the others below which "each" is not tried, and weight of its own error.
+SMALL_ERROR, NOISE_WEIGHT = 1e-3, 2
+#: Number of points per lookup with "each", and largest number of Newton steps for its extinction.
+LOOKUP_POINTS, NEWTON_STEPS = 16, 12
+#: Error of the optical depth at which Newton steps end.
+NEWTON_TOLERANCE = 1e-4
 
 
 class AreaLight(DirectLight):
@@ -94,6 +101,7 @@ class AreaLight(DirectLight):
         self._lines = CLOSEST
         #: points that represent the emitter for mean lengths
         self._places = _places_on(self._shape)
+        self._lookup_points = dr.opaque(mi.UInt32, LOOKUP_POINTS)
         super().__init__(scene, emitter, medium, grid, voxels, classes)
         self.maximum = 2 * dr.pi * max(float(c[0]) for c in self._radiance)
 
@@ -144,10 +152,95 @@ class AreaLight(DirectLight):
             return super()._extinction(scene, depth, classes)
         fields, errors = {}, {}
         for self._lines in LINES:
+            if self._lines == EACH and min(errors.values()) < SMALL_ERROR:
+                break
             fields[self._lines] = self.extinction = super()._extinction(scene, depth, classes)
-            errors[self._lines] = self._depth_error(scene)
+            # The average over points has noise, which the others do not have.
+            weight = NOISE_WEIGHT if self._lines == EACH else 1
+            errors[self._lines] = weight * self._depth_error(scene)
         self._lines = min(errors, key=errors.get)
         return fields[self._lines]
+
+    def _mean_extinction(
+        self, depth: mi.Float | mi.Color3f, sigma_t: mi.Float | mi.Color3f
+    ) -> mi.Float | mi.Color3f:
+        if self._lines != EACH:
+            return super()._mean_extinction(depth, sigma_t)
+        count = dr.opaque(mi.UInt32, self.points_per_voxel)
+        rng = self._stream_of_voxels()
+        shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
+        return self._solve_for_extinction(self._centres, depth, sigma_t, count, shift)
+
+    @symbolic
+    def _solve_for_extinction(
+        self,
+        p: mi.Point3f,
+        depth: mi.Float | mi.Color3f,
+        sigma_t: mi.Float | mi.Color3f,
+        count: mi.UInt32,
+        shift: mi.Vector2f,
+    ):
+        """Find the extinction s of a homogeneous medium that has the optical ``depth``, by Newton's
+        method for the logarithm of the mean transmittance, from ``sigma_t``.
+
+        That logarithm is a convex function of s, so that s increases after the first step, or is
+        halved while the transmittance underflows. Where few lines cross the medium, the equation is
+        ill-conditioned: s is at most the largest extinction of the medium.
+        """
+        shares, s, i = self._solid_angle.shares(p), sigma_t + dr.zeros_like(depth), mi.UInt32(0)
+        most, is_far = self._medium.sigma_t.maximum, mi.Bool(True)
+        while dr.hint(is_far & (i < NEWTON_STEPS), label="Newton steps"):
+            passed, slope, total = self._transmittance_of(s, p, shares, count, shift)
+            excess = dr.log(dr.maximum(passed / total, 1e-30)) + depth
+            step = dr.select(slope > 0, excess * passed / dr.maximum(slope, 1e-30), 0)
+            s = dr.select(passed > 1e-30 * total, dr.clip(s + step, 0, most), 0.5 * s)
+            is_far = _any_channel(dr.abs(excess) > NEWTON_TOLERANCE)
+            i += 1
+        return s
+
+    @symbolic
+    def _transmittance_of(
+        self,
+        extinction: mi.Float | mi.Color3f,
+        p: mi.Point3f,
+        shares: list[mi.Float],
+        count: mi.UInt32,
+        shift: mi.Vector2f,
+    ):
+        """Sum over ``count`` points of the emitter: transmittance of a constant ``extinction``
+        times the solid angle W that a point represents; the same times the length in the medium; W.
+        """
+        vertex = dr.zeros(mi.Interaction3f, dr.width(p))
+        vertex.p = p
+        passed, slope = dr.zeros_like(extinction), dr.zeros_like(extinction)
+        total, k = mi.Float(0), mi.UInt32(0)
+        while dr.hint(k < count, label="points on an emitter"):
+            _, direction, distance, weight = self._sample(vertex, shares, k, shift)
+            length = self._length_within(p, direction, distance)
+            share = weight * dr.exp(-extinction * length)
+            passed += share
+            slope += share * length
+            total += weight
+            k += 1
+        return passed, slope, total
+
+    def depth_of(
+        self, mean: mi.Float | mi.Color3f, p: mi.Point3f, shift: mi.Vector2f | None = None
+    ) -> mi.Float | mi.Color3f:
+        """See the base class."""
+        if self._lines != EACH:
+            return super().depth_of(mean, p)
+        shift = shift_at(p) if shift is None else shift
+        return self._depth_to_points(mean, p, self._lookup_points, shift)
+
+    def _depth_to_points(
+        self, mean: mi.Float | mi.Color3f, p: mi.Point3f, count: mi.UInt32, shift: mi.Vector2f
+    ) -> mi.Float | mi.Color3f:
+        """Return minus the logarithm of the mean transmittance of lines to ``count`` points."""
+        # docs/primer, eq. (2.12)
+        shares = self._solid_angle.shares(p)
+        passed, _, total = self._transmittance_of(mean, p, shares, count, shift)
+        return -dr.log(dr.maximum(passed / dr.maximum(total, 1e-30), 1e-30))
 
     def _depth_error(self, scene: mi.Scene) -> float:
         """Estimate the relative error of the irradiance due to interpolated optical depths.
@@ -159,7 +252,10 @@ class AreaLight(DirectLight):
         transmitted, _, weight, *_ = self._sums(scene, p, count, stream)
         exact = dr.mean(transmitted) / dr.maximum(weight, 1e-20)
         scale = dr.select(self._medium.contains(p), self._solid_angle.at(p), 0)
-        error = dr.abs(dr.mean(mi.Spectrum(dr.exp(-self.depth(p)))) - exact)
+        depth = self.depth(p)
+        if self._lines == EACH:  # without the noise of few points
+            depth = self._depth_to_points(self.extinction.at_world(p), p, count, shift_at(p))
+        error = dr.abs(dr.mean(mi.Spectrum(dr.exp(-depth))) - exact)
         total, reference = dr.sum(scale * error), dr.sum(scale * exact)
         return float(total[0]) / max(float(reference[0]), 1e-30)
 
@@ -176,9 +272,8 @@ class AreaLight(DirectLight):
     def _attenuation(
         self, scene: mi.Scene, p: mi.Point3f
     ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
-        voxels = self._voxels
         count = self.points_per_voxel = self._sample_count(scene)
-        rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
+        rng = self._stream_of_voxels()
         sums = self._sums(scene, p, dr.opaque(mi.UInt32, count), rng, self.order)
         transmitted, visible, _, _, _, angular = sums
         passed = dr.select(transmitted > 0, visible / transmitted, 0)
@@ -190,6 +285,11 @@ class AreaLight(DirectLight):
         self._angular_means = [share * total for total in angular]
         dr.eval(depth, passed, self._angular_means)
         return depth, passed
+
+    def _stream_of_voxels(self) -> mi.PCG32:
+        """Return the random stream of each voxel, which shifts its points on the emitter."""
+        words = mi.sample_tea_32(self._voxels, hashed_seed((self.points_per_voxel, 0))[0])
+        return random_stream(words)
 
     def _sample_count(self, scene: mi.Scene) -> int:
         """Return the number of points on the emitter per voxel.
@@ -232,12 +332,13 @@ class AreaLight(DirectLight):
         that the error of sharp phase functions is noise. They are weighted by the transmittance of
         the mean extinction along the line to each.
         """
-        first, second = (dr.reinterpret_array(mi.UInt32, v) for v in (p.x + p.y, p.z))
-        rng = random_stream(mi.sample_tea_32(first, second))
-        length, depth = self._length_to(p, self._solid_angle.closest(p)), self.depth(p)
-        depth = depth if isinstance(depth, mi.Float) else channel_mean(depth)
-        mean = mean_over(length, depth, 0)
-        return self._mean_residual(basis, p, direction, mean, self._phase_samples, rng, peak_depth)
+        if self._lines == EACH:
+            mean = _mean_of_channels(self.extinction.at_world(p))
+        else:
+            length = self._length_to(p, self._solid_angle.closest(p))
+            mean = mean_over(length, _mean_of_channels(self.depth(p)), 0)
+        count, shift = self._phase_samples, shift_at(p)
+        return self._mean_residual(basis, p, direction, mean, count, shift, peak_depth)
 
     @symbolic
     def _mean_residual(
@@ -247,13 +348,12 @@ class AreaLight(DirectLight):
         direction: mi.Vector3f,
         sigma_t: mi.Float,
         count: mi.UInt32,
-        rng: mi.PCG32,
+        shift: mi.Vector2f,
         peak_depth: mi.Float | mi.Color3f | None,
     ):
         """See `mean_residual`, with ``count`` points and the mean extinction ``sigma_t``."""
         vertex = dr.zeros(mi.Interaction3f, dr.width(p))
         vertex.p = p
-        shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
         coloured = isinstance(peak_depth, mi.Color3f)
         total = mi.Color3f(0) if dr.hint(coloured, mode="scalar") else mi.Float(0)
         shares, sum_of_weights, k = self._solid_angle.shares(p), mi.Float(0), mi.UInt32(0)
@@ -422,6 +522,16 @@ def _with_harmonics(
     """
     harmonics = dr.sh_eval(direction, order)[1:]
     return [dr.fma(weight, y, total) for y, total in zip(harmonics, sums, strict=True)]
+
+
+def _any_channel(mask: mi.Bool | mi.Color3f) -> mi.Bool:
+    """Return whether a condition holds for any channel of a value that may have one."""
+    return mask if isinstance(mask, mi.Bool) else mask[0] | mask[1] | mask[2]
+
+
+def _mean_of_channels(value: mi.Float | mi.Color3f) -> mi.Float:
+    """Return the mean over the channels of a value that may have one."""
+    return value if isinstance(value, mi.Float) else channel_mean(value)
 
 
 def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:

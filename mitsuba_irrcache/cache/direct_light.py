@@ -25,6 +25,7 @@ from mitsuba_irrcache.cache.conservative import unbiased
 from mitsuba_irrcache.cache.peak_depths import peak_depth
 from mitsuba_irrcache.core.fast_math import absorptance, clipped, maximum, minimum
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import random_stream
 from mitsuba_irrcache.core.spectrum import channel_mean, scatter_channels
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
@@ -121,8 +122,18 @@ class DirectLight:
 
     def depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """Return the optical depth of the medium between world positions and the emitter."""
+        return self.depth_of(self.extinction.at_world(p, active), p)
+
+    def depth_of(
+        self, mean: mi.Float | mi.Color3f, p: mi.Point3f, shift: mi.Vector2f | None = None
+    ) -> mi.Float | mi.Color3f:
+        """Return the optical depth that follows from the ``mean`` extinction at world positions.
+
+        ``shift`` moves the points on an emitter with extent that represent it; positions with the
+        same shift have the same points. By default it is a hash of the position.
+        """
         # docs/primer, eq. (2.5)
-        return self.extinction.at_world(p, active) * self.length(p)
+        return mean * self.length(p)
 
     def peak_depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """Return the optical depth of scattering into the truncated forward peak between world
@@ -183,8 +194,15 @@ class DirectLight:
     ) -> GridField:
         """Create the field of the mean extinction, given optical depths at the voxels."""
         sigma_t = self._medium.sigma_t.at_world(self._centres)
-        mean = mean_over(self.length(self._centres), depth, sigma_t)
-        return self._field_of_extinction(mean, classes)
+        return self._field_of_extinction(self._mean_extinction(depth, sigma_t), classes)
+
+    def _mean_extinction(
+        self, depth: mi.Float | mi.Color3f, sigma_t: mi.Float | mi.Color3f
+    ) -> mi.Float | mi.Color3f:
+        """Return mean extinctions at the voxels, the inverse of `depth_of`; ``sigma_t`` where no
+        line to the emitter crosses the medium.
+        """
+        return mean_over(self.length(self._centres), depth, sigma_t)
 
     def _extinction_of_peak(self, classes: VoxelClasses | None) -> GridField:
         """Create the field of the mean extinction of the forward peak over `length`."""
@@ -277,6 +295,13 @@ def mean_over(
 ) -> mi.Float | mi.Color3f:
     """Return the mean extinction of an optical ``depth``; ``otherwise`` where the length is 0."""
     return dr.select(length > 0, depth / dr.select(length > 0, length, 1), otherwise)
+
+
+def shift_at(p: mi.Point3f) -> mi.Vector2f:
+    """Return random numbers in [0, 1) that are a hash of world positions."""
+    first, second = (dr.reinterpret_array(mi.UInt32, v) for v in (p.x + p.y, p.z))
+    rng = random_stream(mi.sample_tea_32(first, second))
+    return mi.Vector2f(rng.next_float32(), rng.next_float32())
 
 
 def _on_grid(
@@ -431,8 +456,9 @@ class DirectLightAlongRays:
         near, far = (extinction * (b - a) for extinction in extinctions)
         at = self._parts(ray, a, b, 0.5 * (near + far))
         middles = [0.5 * (u + v) for u, v in pairwise(at)]
+        shift = shift_at(ray(a))
         depths, inner = (
-            [dr.lerp(*means, u) * light.length(ray(dr.lerp(a, b, u))) for u in places]
+            [light.depth_of(dr.lerp(*means, u), ray(dr.lerp(a, b, u)), shift) for u in places]
             for places in (at, middles)
         )
         passed = [dr.fma(near, u * (1 - 0.5 * u), far * (0.5 * u * u)) for u in at]

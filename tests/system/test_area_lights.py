@@ -113,7 +113,7 @@ def test_single_scattering(scenes, name):
 
 
 @pytest.mark.usefixtures("mono")
-@pytest.mark.parametrize(("sigma_t", "bound"), [(1.0, 0.015), (4.0, 0.05)])
+@pytest.mark.parametrize(("sigma_t", "bound"), [(1.0, 0.015), (4.0, 0.01)])
 def test_single_scattering_by_sweep(scenes, sigma_t, bound):
     """Solver ``sweep`` evaluates emitters beside the medium in the same way, also dense ones."""
     mean, blocks = errors(scenes, "rectangle above", sigma_t, solver="sweep", resolution=32)
