@@ -61,7 +61,7 @@ MOST_LIGHTS, MOST_VALUES, VALUES = 8, 14 << 24, 14
 
 #: Lines from a position to an emitter whose lengths in the medium divide optical depths: that to
 #: the closest point, those to several points, or none. With "each", transmittances of the mean
-#: extinction are averaged over points instead (docs/primer, eq. (2.12)).
+#: extinction are averaged over points instead (docs/primer, eq. (2.10)).
 CLOSEST, SEVERAL, NONE, EACH = LINES = ("closest", "several", "none", "each")
 #: Relative error of the others below which "each" is not tried, and weight of its own error.
 SMALL_ERROR, NOISE_WEIGHT = 1e-3, 2
@@ -237,7 +237,7 @@ class AreaLight(DirectLight):
         self, mean: mi.Float | mi.Color3f, p: mi.Point3f, count: mi.UInt32, shift: mi.Vector2f
     ) -> mi.Float | mi.Color3f:
         """Return minus the logarithm of the mean transmittance of lines to ``count`` points."""
-        # docs/primer, eq. (2.12)
+        # docs/primer, eq. (2.10)
         shares = self._solid_angle.shares(p)
         passed, _, total = self._transmittance_of(mean, p, shares, count, shift)
         return -dr.log(dr.maximum(passed / dr.maximum(total, 1e-30), 1e-30))

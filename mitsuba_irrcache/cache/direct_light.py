@@ -396,7 +396,7 @@ class DirectLightAlongRays:
 
         ``with_peak`` and ``peak_depth`` are as in `AngularField.factor`.
         """
-        # docs/primer, eq. (2.11)
+        # docs/primer, eq. (2.12)
         light, basis = self._light, self._basis
         if light.has_one_direction:
             gain = basis.gain(p, direction, light.towards(p), with_peak)

@@ -266,7 +266,7 @@ def _polygon_solid_angle(corners: list[mi.Point3f], p: mi.Point3f) -> mi.Float:
     and Strackee 1983). The sum of the arguments, which is less than pi, is the argument of the
     product.
     """
-    # docs/primer, eq. (2.10)
+    # docs/primer, eq. (2.11)
     towards = [dr.normalize(mi.Vector3f(corner - p)) for corner in corners]
     first, real, imaginary = towards[0], mi.Float(1), mi.Float(0)
     for a, b in pairwise(towards[1:]):
