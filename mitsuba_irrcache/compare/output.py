@@ -20,7 +20,14 @@ from .report import Figure, Section, findings, write_report
 from .results import Measurement, write_json
 from .scores import reference_noise, score_all
 from .summary import curves
-from .tables import Table, equal_error_table, equal_time_table, metrics_table, stages_table
+from .tables import (
+    Table,
+    equal_error_table,
+    equal_time_table,
+    estimates_table,
+    metrics_table,
+    stages_table,
+)
 
 
 @dataclass
@@ -51,6 +58,7 @@ def write_output(comparison: Comparison, folder: Path) -> list[Table]:
         equal_time_table(drawn, comparison.budgets),
         equal_error_table(drawn),
         stages_table(comparison.measurements),
+        *estimates_table(rows),
     ]
     sections = _sections(comparison, rows, tables, folder) if rows else []
     write_report(
@@ -75,7 +83,7 @@ def _sections(
     pictures.strip(figures / "strip.png", measured, truth, folder, comparison.exposure)
     pictures.differences(figures / "differences.png", measured, truth, folder)
     pictures.differences(figures / "blocks.png", measured, truth, folder, block=8)
-    equal_time, equal_error, stages = tables
+    equal_time, equal_error, stages, *estimates = tables
     error = Figure(
         curve,
         "Error against time. Hollow: below the resolution of the reference.",
@@ -95,6 +103,7 @@ def _sections(
         Section("Images and their errors", [shown]),
         Section("Error after equal time", [equal_time]),
         Section("Time to equal error", [equal_error]),
+        *(Section(table.title, [table]) for table in estimates),
         Section("Time by stage", [first, stages]),
         Section("All errors", [others, metrics_table(rows)]),
     ]
@@ -125,7 +134,7 @@ def _record(comparison: Comparison, rows: list[dict]) -> dict:
 
 
 #: Columns of a row that describe the measurement; the others are errors.
-_OWN_COLUMNS = ("integrator", "budget", "spp", "note", "image")
+_OWN_COLUMNS = ("integrator", "budget", "spp", "note", "estimate", "image")
 
 
 def _plain(value: object) -> object:

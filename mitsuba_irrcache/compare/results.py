@@ -23,6 +23,7 @@ class Snapshot:
         spp: camera samples per pixel in the image.
         image: name of the EXR file, relative to the report.
         note: a description of how the budget was spent.
+        estimate: RMSE that the integrator itself estimates, in units of the mean radiance.
     """
 
     budget: float
@@ -30,6 +31,7 @@ class Snapshot:
     spp: int
     image: str = ""
     note: str = ""
+    estimate: float | None = None
 
     @property
     def total(self) -> float:

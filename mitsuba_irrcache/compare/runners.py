@@ -7,6 +7,8 @@ It is selected by the methods that an integrator offers, never by the integrator
   one at each of the ``times``; each has an ``image``, ``samples`` of the cache, and ``seconds`` by
   stage since the beginning, excluding time between frames. Images that are rendered during the
   iteration use the cache as it is. All snapshots are of one run.
+* ``depends_on_view`` is true: the integrator chooses its effort for a stated error, and afterwards
+  has a ``certificate`` with the estimated ``error``. There is one image, whatever the budgets.
 * ``prepare(scene)`` builds a cache; images are averaged after it.
 * Others have images only, which are averaged.
 """
@@ -153,6 +155,11 @@ def is_progressive(scene: mi.Scene) -> bool:
     return callable(getattr(scene.integrator(), "progressive", None))
 
 
+def states_error(scene: mi.Scene) -> bool:
+    """Return whether the integrator chooses its effort for an error that the user states."""
+    return bool(getattr(scene.integrator(), "depends_on_view", False))
+
+
 def effort_is_free(subject: Subject) -> bool:
     """Return whether the effort for the cache may be chosen here.
 
@@ -168,6 +175,9 @@ def run(subject: Subject, scene: mi.Scene, budgets: list[float]) -> Frames:
 
     The integrator must have rendered an image already, so that its kernels are compiled.
     """
+    if states_error(scene):
+        yield _certified(subject, budgets)
+        return
     if is_progressive(scene) and effort_is_free(subject) and not subject.is_filtered_here:
         yield from _refined(subject, scene, budgets)
         return
@@ -179,6 +189,20 @@ def run(subject: Subject, scene: mi.Scene, budgets: list[float]) -> Frames:
     else:
         scene = subject.load()
         yield from accumulate(subject, scene, budgets, spp, {"cache": prepare(scene)})
+
+
+def _certified(subject: Subject, budgets: list[float]) -> tuple[Snapshot, np.ndarray]:
+    """Return an image of a stated error, with its estimate, for the first budget that suffices."""
+    scene = subject.load()
+    image, seconds = subject.render(scene, 0)
+    spent = sum(seconds.values())
+    budget = min((b for b in budgets if b >= spent), default=max(budgets))
+    certificate = scene.integrator().certificate
+    if certificate is None:  # stopped by a timeout
+        return Snapshot(budget, seconds, 0), image
+    spp, error = int(certificate.settings["spp"]), certificate.error
+    estimate = error if np.isfinite(error) else None
+    return Snapshot(budget, seconds, spp, note=str(certificate), estimate=estimate), image
 
 
 def accumulate(

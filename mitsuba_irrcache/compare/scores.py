@@ -83,5 +83,6 @@ def _row(measurement: Measurement, snapshot: Snapshot) -> dict:
         **{f"seconds_{stage}": value for stage, value in snapshot.seconds.items()},
         "spp": snapshot.spp,
         "note": snapshot.note,
+        "estimate": snapshot.estimate,
         "image": snapshot.image,
     }

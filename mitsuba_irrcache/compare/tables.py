@@ -72,6 +72,26 @@ def equal_error_table(curves: list[Curve]) -> Table:
     return Table("Time to equal error", ["RMSE", *_names(curves)], rows, note, best)
 
 
+def estimates_table(rows: list[dict]) -> list[Table]:
+    """Return the table of the errors that integrators estimate themselves, beside the true ones;
+    nothing if none does.
+    """
+    cells = [
+        [
+            row["integrator"], f"{seconds(row['seconds'])} s", percent(row["estimate"]),
+            _metric(row, "rmse"),
+        ]
+        for row in rows
+        if row["estimate"] is not None
+    ]  # fmt: skip
+    head = ["integrator", "time", "estimated RMSE", "true RMSE"]
+    note = (
+        "Images with a stated error (property tolerance of irrcache): the RMSE that the integrator "
+        "estimates, and the measured one, whose reference's noise is removed."
+    )
+    return [Table("Estimated and true error", head, cells, note)] if cells else []
+
+
 def stages_table(measurements: list[Measurement]) -> Table:
     """Return the table of memory and of the seconds by stage to a first image."""
     rows = []

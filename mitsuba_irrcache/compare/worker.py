@@ -123,7 +123,7 @@ def _first_image(job: dict, seconds: dict[str, float]) -> tuple[Subject, mi.Scen
     seconds["load"] = time.perf_counter() - began
     cached = runners.has_cache(scene)
     effort = {}
-    if cached and runners.effort_is_free(subject):
+    if cached and not runners.states_error(scene) and runners.effort_is_free(subject):
         effort = {runners.EFFORT: runners.LEAST_EFFORT}
         scene = subject.load(**effort)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):

@@ -43,6 +43,7 @@ from mitsuba_irrcache.solvers.grid_size import (
     choose_grid,
     warn_of_dense_border,
     warn_of_opaque_voxels,
+    warn_of_unresolved_detail,
 )
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 
@@ -62,6 +63,7 @@ class CacheSettings:
     seed: int = 0
     file: str = ""
     with_error: bool = False  # whether a standard error is needed: at least two batches
+    is_trial: bool = False  # whether a search tries several caches, and reports their errors
 
 
 class CachedMedium:
@@ -194,8 +196,10 @@ class CachedMedium:
         grid, size_reason = self._choose_grid()
         basis = _angular_basis(scene, medium)
         self._check_memory(grid, basis.count if basis is not None else 0)
-        warn_of_dense_border(medium, grid)
-        warn_of_opaque_voxels(medium, grid, settings.max_depth)
+        if not settings.is_trial:
+            warn_of_dense_border(medium, grid)
+            if not warn_of_opaque_voxels(medium, grid, settings.max_depth):
+                warn_of_unresolved_detail(medium, grid)
         active, classes = self._active_voxels(scene, grid)
         self._log_choices(grid, size_reason, dr.width(active))
         samples = settings.samples or solver.default_samples(

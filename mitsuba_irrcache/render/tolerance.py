@@ -110,7 +110,8 @@ class Level:
     def error_of_detail(self) -> float:
         """Return the estimated error due to detail of the data that the voxels do not resolve."""
         parts = [part for part in self.builder.parts if part.cache is not None]
-        return max((unresolved_error(p.medium, p.cache.grid) for p in parts), default=0.0)
+        errors = (unresolved_error(part.medium, part.cache.grid) for part in parts)
+        return max(errors, default=0.0) / 100
 
 
 class ToleranceSearch:
@@ -233,7 +234,9 @@ class ToleranceSearch:
         """Return a level whose cache is empty, and has this number of samples in its first part."""
         given = self._settings.samples
         samples = -(-given // 2) if given else samples
-        settings = replace(self._settings, resolution=resolution, samples=samples, file="")
+        settings = replace(
+            self._settings, resolution=resolution, samples=samples, file="", is_trial=True
+        )
         return Level(resolution, self._new_builder(settings), self._camera_rays)
 
     def _closed_form(self, scene: mi.Scene) -> str | None:
@@ -369,7 +372,7 @@ class _CacheFit:
             return
         level.first, level.part = self.probe(level), builder.done
         builder.samples = 2 * level.part
-        # docs/primer, eq. (7.4)
+        # docs/primer, eq. (7.5)
         builder.update(self._scene, self._progress)
         level.radiance = self.probe(level)
         level.scatter = _rms(level.radiance - level.first) / self.mean
@@ -445,7 +448,7 @@ class _CacheFit:
 
     def _order(self, levels: list[Level]) -> float:
         """Estimate the order of the error in the voxel edge from the last three levels."""
-        # docs/primer, eq. (7.3)
+        # docs/primer, eq. (7.4)
         if len(levels) < 3 or levels[-3].resolution < FEWEST:
             return ASSUMED_ORDER
         a, b, c = levels[-3:]

@@ -61,6 +61,13 @@ MOST_REFINED = 1 << 24
 #: the optical depth d of a voxel, and the part a of the data that interpolation between voxels
 #: loses, it is DEPTH_ERROR d + DETAIL_ERROR a min(d, MOST_DETAIL_DEPTH).
 SMOOTH_ERROR, DEPTH_ERROR, DETAIL_ERROR, MOST_DETAIL_DEPTH = 0.4, 0.3, 7.0, 0.25
+#: RMSE [% of the mean] of an image due to detail of the data that voxels do not resolve:
+#: UNRESOLVED_ERROR a min(d, OPAQUE), with a and d as above, about, for the scenes of
+#: experiments/validation/defaults. Voxels are refined above LARGE_UNRESOLVED, to at most
+#: MOST_FOR_DETAIL voxels.
+UNRESOLVED_ERROR, LARGE_UNRESOLVED, MOST_FOR_DETAIL = 6.0, 1.0, 1 << 22
+#: Error [%] above which the warning is logged.
+NOTABLE_UNRESOLVED = 0.8
 #: Ratio between the resolutions that are tried, the largest of them in units of the resolution
 #: chosen otherwise, and number of positions at which detail is measured.
 SIZE_RATIO, LARGEST_SHARE, POSITIONS = 2**0.25, 0.9, 1 << 20
@@ -183,6 +190,10 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
         smooth = _size_in_smooth_light(medium, np.minimum(least, sides), sides)
         if smooth is not None:
             sides, reason = smooth, "as smooth light and data permit"
+    if rule.refines_dense_data:
+        refined = _refined_for_detail(medium, sides, min(voxels, MOST_REFINED, MOST_FOR_DETAIL))
+        if refined is not sides:
+            sides, reason = refined, "finer than those of the medium, which has dense detail"
     # Round down to respect the limits, except for rounding errors of whole numbers.
     sides = np.maximum(np.floor(sides + 1e-4), 1).astype(int)
     return Grid(tuple(int(n) for n in sides[::-1]), frame), reason
@@ -246,16 +257,33 @@ def _lost_detail(medium: MediumGrid, sides: np.ndarray) -> float:
 
 
 def unresolved_error(medium: MediumGrid, grid: Grid) -> float:
-    """Estimate the error of an image, in units of its mean, due to detail of a medium's data that
-    is lost between the voxels of ``grid``.
-
-    It holds in smooth light; see `SMOOTH_ERROR`.
+    """Estimate the error [%] of an image, in units of its mean, due to detail of a medium's data
+    that is lost between the voxels of ``grid``.
     """
+    return _error_of_detail(medium, np.array(grid.resolution))
+
+
+def _error_of_detail(medium: MediumGrid, sides: np.ndarray) -> float:
+    """Return `unresolved_error` for this number of voxels along x, y, z."""
     if medium.sigma_t.grid is None:
         return 0.0
-    edge = _colliding_extinction(medium) * grid.voxel_size.max()
-    error = DEPTH_ERROR * edge + DETAIL_ERROR * min(edge, MOST_DETAIL_DEPTH)
-    return _lost_detail(medium, np.array(grid.resolution)) * error / 100
+    # docs/primer, eq. (7.3)
+    lengths = np.linalg.norm(medium.frame[:3, :3], axis=0)
+    depth = (_colliding_extinction(medium) * lengths / sides).max()
+    return UNRESOLVED_ERROR * min(depth, OPAQUE) * _lost_detail(medium, sides)
+
+
+def _refined_for_detail(medium: MediumGrid, sides: np.ndarray, most: int) -> np.ndarray:
+    """Return numbers of voxels along x, y, z, at least ``sides`` and at most ``most`` in all, whose
+    error due to unresolved detail is at most LARGE_UNRESOLVED, if so many suffice.
+    """
+    refined = sides
+    while _error_of_detail(medium, np.maximum(np.floor(refined + 1e-4), 1)) > LARGE_UNRESOLVED:
+        refined = refined * SIZE_RATIO
+        if np.prod(refined) > most:
+            break
+        sides = refined
+    return sides
 
 
 def _colliding_extinction(medium: MediumGrid) -> float:
@@ -296,22 +324,36 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
         )
 
 
-def warn_of_opaque_voxels(medium: MediumGrid, grid: Grid, max_depth: int) -> None:
-    """Log a warning if voxels are too opaque for several orders of scattering."""
+def warn_of_opaque_voxels(medium: MediumGrid, grid: Grid, max_depth: int) -> bool:
+    """Log a warning if voxels are too opaque for several orders of scattering; return whether."""
     data = (medium.original or medium).sigma_t.grid
     if max_depth == 2 or data is None:
-        return
+        return False
     sigma_t = _colliding_extinction(medium)
     edge, size = data.voxel_size.max(), grid.voxel_size.max()
     error = OPAQUE_ERROR * (sigma_t * edge) ** OPAQUE_DEPTH_ORDER
     error = min(error * (size / edge) ** OPAQUE_SIZE_ORDER, MOST_OPAQUE_ERROR)
-    if error > LARGE_OPAQUE_ERROR or sigma_t * size > OPAQUE_VOXEL:
+    is_large = error > LARGE_OPAQUE_ERROR or sigma_t * size > OPAQUE_VOXEL
+    if is_large:
         mi.Log(
             mi.LogLevel.Warn,
             f"irrcache: voxels of the cache have a mean optical depth of {sigma_t * size:.2g}: "
             f"errors of up to about {error:.0f} % of the mean, and {OPAQUE_PEAK * error:.0f} % in "
             "small regions, are expected where the extinction varies within a few voxels. Raise "
             "resolution.",
+        )
+    return is_large
+
+
+def warn_of_unresolved_detail(medium: MediumGrid, grid: Grid) -> None:
+    """Log a warning if dense detail of the data is smaller than the voxels of the cache."""
+    error = unresolved_error(medium, grid)
+    if error > NOTABLE_UNRESOLVED:
+        mi.Log(
+            mi.LogLevel.Warn,
+            "irrcache: the data have dense detail that the voxels of the cache do not resolve: "
+            f"an error of about {error:.1f} % of the mean is expected. Raise resolution "
+            f"(now {max(grid.shape)}), or set tolerance to have it chosen.",
         )
 
 

@@ -41,8 +41,9 @@ TOLERANCES = (0.02, 0.005, 0.001)
 RESOLUTIONS, DIRECTIONS, SAMPLES = (16, 32, 64), (64, 256), (16, 64)
 #: Samples per pixel at default settings.
 DEFAULT_SPP = 64
-#: Largest resolution, directions and samples per pixel of the fine cache, and paths of ``path``.
-FINEST, FINE_DIRECTIONS, FINE_SPP, FINE_PATHS = 96, 256, 256, 2048
+#: Largest resolution of the fine cache, the same for ``path`` and anisotropic scattering,
+#: directions, samples per pixel, and paths of ``path``.
+FINEST, FINEST_SLOW, FINE_DIRECTIONS, FINE_SPP, FINE_PATHS = 96, 64, 256, 256, 1024
 #: Most samples per pixel of a half at once.
 LARGEST_SPP = 1024
 SIGMAS = 3.0
@@ -124,8 +125,9 @@ class Experiment:
         caches = [c for c in scene.integrator().caches.values() if c is not None]
         size = max([max(c.grid.shape) for c in caches] or [1])
         is_path = scene.integrator()._builder.solver == "path"
+        is_slow = is_path or any(cache.directional is not None for cache in caches)
         fine = {
-            "resolution": min(2 * size, FINEST // 2 if is_path else max(FINEST, size)),
+            "resolution": min(2 * size, max(FINEST_SLOW if is_slow else FINEST, size)),
             "cache_spp": FINE_PATHS if is_path else FINE_DIRECTIONS,
             "cache_seed": 99,
         }

@@ -261,3 +261,19 @@ def test_which_integrators_accept_an_effort(tmp_path):
     ):
         subject = runners.Subject(scene, {}, integrator)
         assert runners.effort_is_free(subject) is expected, integrator
+
+
+@pytest.mark.parametrize(("seconds", "budget"), [(0.5, 1.0), (2.0, 4.0), (9.0, 4.0)])
+def test_a_stated_error_has_one_image_with_its_estimate(seconds, budget):
+    """It counts for the first budget that suffices, and its samples are those it has chosen."""
+    integrator = SimpleNamespace(
+        depends_on_view=True,
+        certificate=SimpleNamespace(settings={"spp": 8}, error=0.004, __str__=lambda: "parts"),
+    )
+    scene, subject = SimpleNamespace(integrator=lambda: integrator), Renderer(seconds)
+    subject.load = lambda: scene
+    ((snapshot, _),) = runners.run(subject, scene, [1.0, 4.0])
+    assert (snapshot.budget, snapshot.spp, snapshot.estimate) == (budget, 8, 0.004)
+    integrator.certificate = None  # a search that was stopped
+    ((snapshot, _),) = runners.run(subject, scene, [1.0, 4.0])
+    assert snapshot.estimate is None

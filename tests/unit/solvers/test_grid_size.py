@@ -196,3 +196,32 @@ def test_opaque_voxels_are_announced(count, depth, max_depth, warns, monkeypatch
     grid_size.warn_of_opaque_voxels(dense, grid, max_depth)
     assert bool(messages) is warns
     assert all(level == mi.LogLevel.Warn and "Raise resolution" in t for level, t in messages)
+
+
+def specks(count: int, sigma_t: float) -> np.ndarray:
+    """Return single dense voxels in air."""
+    rng = np.random.default_rng(3)
+    return np.where(rng.random((count,) * 3) < 0.004, sigma_t, 0.0)
+
+
+def test_dense_detail_needs_more_voxels():
+    """Single dense voxels need more voxels than even matter of the same extinction; thin ones do
+    not, nor does `path`, whose noise is larger.
+    """
+    for depth, finer in ((0.1, False), (1.0, True)):
+        sizes = [max(chosen(of(40, 40 * depth))) for of in (specks, in_air)]
+        assert (sizes[0] > 1.2 * sizes[1]) is finer
+    assert chosen(specks(40, 40.0), solver="path") == (40, 40, 40)
+
+
+def test_unresolved_detail_is_announced(monkeypatch):
+    """A cache that cannot be fine enough says so, with the error that is expected."""
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append((level, text)))
+    monkeypatch.setattr(grid_size, "MOST_FOR_DETAIL", 40**3)
+    for values, warns in ((specks(40, 40.0), True), (soft(40, 40.0), False)):
+        messages.clear()
+        grid, _ = choose_grid(medium(values), 0, solver_named("sweep").size_rule)
+        grid_size.warn_of_unresolved_detail(medium(values), grid)
+        assert bool(messages) is warns
+    assert all("% of the mean is expected" in text for _, text in messages)
