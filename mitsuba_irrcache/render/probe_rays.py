@@ -14,8 +14,9 @@ from mitsuba_irrcache.render.film import CameraSampler, PixelPositions, camera_r
 #: Pixels whose radiance is compared, and rays of each: detail that is smaller than a pixel averages
 #: out in an image, and must do so here.
 PIXELS, RAYS_PER_PIXEL = 1 << 11, 8
-#: Pixels that are rendered with several seeds, and these seeds; pixels for the mean radiance.
-SAMPLED_PIXELS, GROUPS, MEAN_PIXELS = 1 << 9, 2, 1 << 12
+#: Pixels that are rendered with several seeds, and these seeds; pixels for the mean radiance. A few
+#: pixels at edges may have most of the variance.
+SAMPLED_PIXELS, GROUPS, MEAN_PIXELS = 1 << 11, 2, 1 << 12
 
 
 class ProbeRays:

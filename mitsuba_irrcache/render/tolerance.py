@@ -43,15 +43,17 @@ LEAST_OF_DIRECTIONS = 0.3
 SCALES = ("image", "volume")
 #: Resolution of the first cache, the ratio between resolutions, and its minimum.
 COARSEST, LARGEST_RATIO, SMALLEST_RATIO = 8, 2.0, 1.3
-#: Order of the error in the voxel edge: assumed if it is not known, and its limits. Fewer voxels
-#: than FEWEST are too few to estimate it.
-ASSUMED_ORDER, ORDERS, FEWEST = 1.3, (0.8, 1.7), 16
+#: Order of the error in the voxel edge: assumed for the first two levels, and if it is not known,
+#: and its limits. Fewer voxels than FEWEST are too few to estimate it.
+FIRST_ORDER, ASSUMED_ORDER, ORDERS, FEWEST = 1.0, 1.3, (0.8, 1.7), 16
 #: The next resolution is larger by this factor than predicted.
 MARGIN = 1.1
 #: Finest resolution that is tried, unless the data have more voxels along their longest side.
 FINEST = 256
-#: Directions or samples of a part of a cache: of the first cache, and limits.
-FIRST_PART, PARTS = 64, (64, 256)
+#: Least directions or samples of a part of a cache, for single scattering and several orders: the
+#: ordinates that solve for all orders are few in a small part, and the solution is then not only
+#: noisy, but too bright (.7 % of the mean with 64 and an albedo of .98 at depth 12). Most of them.
+LEAST_PART_ONCE, LEAST_PART, LARGEST_PART = 64, 128, 256
 #: Ratio of the scatter of fine to that of coarse caches, about; and the number of independent
 #: values, about, in an image's noise due to directions, which all pixels share.
 LESS_SCATTER, INDEPENDENT = 0.4, 10
@@ -230,10 +232,17 @@ class ToleranceSearch:
             self._view = ()
         first.update(scene, progress)
 
-    def level(self, resolution: int, samples: int = FIRST_PART) -> Level:
-        """Return a level whose cache is empty, and has this number of samples in its first part."""
+    @property
+    def least_part(self) -> int:
+        """Least samples of a part of a cache."""
+        return LEAST_PART_ONCE if self._settings.max_depth == 2 else LEAST_PART
+
+    def level(self, resolution: int, samples: int = 0) -> Level:
+        """Return a level whose cache is empty, and has this number of samples in its first part;
+        0: the least.
+        """
         given = self._settings.samples
-        samples = -(-given // 2) if given else samples
+        samples = -(-given // 2) if given else samples or self.least_part
         settings = replace(
             self._settings, resolution=resolution, samples=samples, file="", is_trial=True
         )
@@ -353,7 +362,7 @@ class _CacheFit:
         self._search.is_stopped = True
         self._notes.append(f"the time did not suffice {what}")
 
-    def _add(self, resolution: int, samples: int = FIRST_PART) -> None:
+    def _add(self, resolution: int, samples: int = 0) -> None:
         """Add a level of another resolution."""
         level = self._search.level(resolution, samples)
         level.builder.update(self._scene, self._progress)
@@ -449,7 +458,9 @@ class _CacheFit:
     def _order(self, levels: list[Level]) -> float:
         """Estimate the order of the error in the voxel edge from the last three levels."""
         # docs/primer, eq. (7.4)
-        if len(levels) < 3 or levels[-3].resolution < FEWEST:
+        if len(levels) < 3:
+            return FIRST_ORDER
+        if levels[-3].resolution < FEWEST:
             return ASSUMED_ORDER
         a, b, c = levels[-3:]
         coarse, fine = self._difference(a, b), self._difference(b, c)
@@ -481,12 +492,14 @@ class _CacheFit:
         """
         last = self._levels[-1]
         if len(self._levels) < 2:
-            return FIRST_PART
+            return self._search.least_part
         if len(self._levels) > 2:
             return last.part
         excess = LESS_SCATTER * last.scatter / self._search.share("directions")
         needed = max(last.builder.done * excess**2, 1.0)
-        return int(2 ** np.round(np.log2(np.clip(needed / 2, *PARTS))))
+        return int(
+            2 ** np.round(np.log2(np.clip(needed / 2, self._search.least_part, LARGEST_PART)))
+        )
 
     def refine_directions(self, others: dict[str, float]) -> float:
         """Add parts to the finest cache until the error of the directions is at most what the
