@@ -36,6 +36,7 @@ from mitsuba_irrcache.render.film import check_film, exclusive
 if TYPE_CHECKING:  # most programs compute no gradients: their modules are imported on use
     from mitsuba_irrcache.gradients.backward import ParameterAdjoint
     from mitsuba_irrcache.gradients.operations import SharedIrradiance
+    from mitsuba_irrcache.gradients.traced import TracedAdjoint
     from mitsuba_irrcache.out_of_core.rendering import MappedMedium
 
 
@@ -230,12 +231,14 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     Gradients (``dr.backward``, ``dr.forward``) are computed by ``sigma_t`` and ``albedo`` of a
     medium, by ``g`` of its phase function ``hg``, and by the radiance of emitters, by solving the
-    adjoint transport equation: for one medium in a box or sphere under distant and point emitters
-    (not inside of it if delta-M applies), without surfaces, with the solver ``sweep``,
-    ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. Emissive media have gradients by
-    ``emission`` only. All other gradients are refused with an error that names the parameter. While
-    parameters carry gradients, the grid of the cache is kept. Images of the same state of the scene
-    in one loss share one adjoint solve; ``cache_spp`` also sets its directions.
+    adjoint transport equation with the solver ``sweep``, for one medium in a box or sphere under
+    distant and point emitters (not inside of it if delta-M applies), with ``max_depth`` 1, 2 or -1,
+    no filter and no ``aovs``. Emissive media have gradients by ``emission`` only. Surfaces, area
+    emitters and several media may be around isotropic media if ``max_depth`` is -1; ``dr.backward``
+    then has gradients by the reflectance of ``diffuse`` BSDFs, too. All other gradients are refused
+    with an error that names the parameter. While parameters carry gradients, the grid of the cache
+    is kept. Images of the same state of the scene in one loss share one adjoint solve;
+    ``cache_spp`` also sets its directions.
 
     .. tabs::
         .. code-tab:: xml
@@ -556,17 +559,21 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def adjoint(
         self, scene: mi.Scene, params: mi.SceneParameters, keys: list[str], seed: int
-    ) -> ParameterAdjoint:
+    ) -> ParameterAdjoint | TracedAdjoint:
         """Return the derivatives of images of ``scene`` by the parameters ``keys``."""
         from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check
+        from mitsuba_irrcache.gradients.traced import TracedAdjoint
 
         self._source.refuse_tolerance("an objective would jump with the resolution")
         self._source.refuse_mapped("a gradient")
         camera_rays = self._prepared(scene)
-        check(self._builder.parts, keys, self._options.rays.layered)
-        (part,) = self._builder.parts
-        image = camera_rays, self._options.rays.step, self._options.emission
-        return ParameterAdjoint(scene, params, keys, part, image, seed)
+        parts, rays = self._builder.parts, self._options.rays
+        check(parts, keys, rays.layered)
+        if not parts[0].medium.is_isolated:
+            image = rays.step, rays.hide_emitters
+            return TracedAdjoint(scene, params, keys, parts, image, seed)
+        image = camera_rays, rays.step, self._options.emission
+        return ParameterAdjoint(scene, params, keys, parts[0], image, seed)
 
     def to_string(self) -> str:
         """Return all properties with their values, to record how an image was computed."""

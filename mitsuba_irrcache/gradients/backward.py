@@ -5,25 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.gradients.emitter_tangents import EmitterTangents
 from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
-from mitsuba_irrcache.gradients.film import LUMINANCE, FilmAdjoint
+from mitsuba_irrcache.gradients.film import LANES, FilmAdjoint
 from mitsuba_irrcache.gradients.medium import MediumAdjoint, field_of, original_of
 from mitsuba_irrcache.gradients.parameters import (
     EMISSION,
     MEAN_COSINE,
+    by_parameter,
     channels_of,
     refuse_all,
     roles_of,
     shaped_like,
 )
 from mitsuba_irrcache.gradients.tangent import ImageTangent, changed_field
-from mitsuba_irrcache.grids.fields import Field
+from mitsuba_irrcache.gradients.traced import check as check_traced
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, position_of
 from mitsuba_irrcache.lights.falloff import edges_away
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
@@ -52,14 +51,10 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
         )
     if layered:
         refuse_all(keys, "the image is filtered or has aovs", "Set filter to none and no aovs")
-    (part, *others), medium = parts, parts[0].medium
-    if others or not medium.is_isolated:
-        refuse_all(
-            keys,
-            "there are surfaces, area lights or several media, or the boundary is neither a "
-            "box nor a sphere",
-            "Reduce the scene to one medium under distant and point lights",
-        )
+    part, medium = parts[0], parts[0].medium
+    if not medium.is_isolated:
+        check_traced(parts, keys)
+        return
     name = f'medium "{medium.name}"'
     if part.half_space is not None:
         refuse_all(keys, f"{name} is opaque and homogeneous, and has no cache", "Set resolution")
@@ -98,6 +93,9 @@ class ParameterAdjoint:
     scene and the integrator's properties ``step`` and ``emission``; ``seed`` determines the
     ordinates.
     """
+
+    #: camera samples of a launch
+    lanes = LANES
 
     def __init__(
         self,
@@ -189,17 +187,3 @@ def _check_emission(part: CachedMedium, of_medium: dict[str, str]) -> None:
             "the emission is 0 everywhere, and ignored",
             "Start with a small positive value",
         )
-
-
-def by_parameter(value: object, field: Field, grad: mi.Float) -> mi.Float:
-    """Return the derivative with respect to a parameter's ``value``, given the derivative ``grad``
-    with respect to the ``field`` computed from it: grids have a scale, and monochromatic variants
-    store the luminance of coloured data.
-    """
-    if field.grid is None:
-        return grad * dr.opaque(mi.Float, field.scale)
-    grad = grad * field.scale
-    if dr.is_tensor_v(value) and value.shape[3] != field.channels:
-        grad = interleaved([grad * share for share in LUMINANCE])
-    dr.eval(grad)
-    return grad

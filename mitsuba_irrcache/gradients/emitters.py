@@ -77,7 +77,7 @@ class EmitterAdjoint:
         interaction.wi = direction
         dr.eval(interaction, adjoint)
         with dr.resume_grad():
-            _pull(self._environment.eval(interaction), adjoint)
+            pull(self._environment.eval(interaction), adjoint)
 
     def _derivatives_by_ordinates(
         self, transport: AdjointTransport, found: Derivatives
@@ -156,7 +156,7 @@ def _add_point(light: int, transport: AdjointTransport, found: Derivatives) -> N
     dr.eval(at, adjoint)
     with dr.resume_grad():
         _, value = emitter.sample_direction(at, mi.Point2f(0.5))
-        _pull(value, adjoint)
+        pull(value, adjoint)
 
 
 def _add_sun(emitter: mi.Emitter, adjoint: np.ndarray) -> None:
@@ -164,10 +164,10 @@ def _add_sun(emitter: mi.Emitter, adjoint: np.ndarray) -> None:
     weights = mi.Spectrum([dr.opaque(mi.Float, float(v)) for v in adjoint])
     with dr.resume_grad():
         _, value = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1), mi.Point2f(0.5))
-        _pull(value, weights)
+        pull(value, weights)
 
 
-def _pull(value: mi.Spectrum, adjoint: mi.Spectrum) -> None:
+def pull(value: mi.Spectrum, adjoint: mi.Spectrum) -> None:
     """Accumulate derivatives of ``value . adjoint`` in the parameters that ``value`` depends on."""
     if dr.grad_enabled(value):
         # Keep the edges of the AD graph: an emitter is evaluated more than once.

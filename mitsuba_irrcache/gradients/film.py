@@ -33,12 +33,14 @@ class CameraPass:
 
 
 class SampledCamera:
-    """The camera samples of an image of ``sensor``, ``spp`` in each pixel (0: of its sampler)."""
+    """The camera samples of an image of ``sensor``, ``spp`` in each pixel (0: of its sampler), at
+    most ``lanes`` in a launch.
+    """
 
-    def __init__(self, sensor: mi.Sensor, seed: int, spp: int) -> None:
+    def __init__(self, sensor: mi.Sensor, seed: int, spp: int, lanes: int = LANES) -> None:
         self._sensor, self._film = sensor, sensor.film()
         self._seed, self._spp = seed, spp or sensor.sampler().sample_count()
-        self._frame = SampledFilm(self._film, self._spp, LANES)
+        self._frame = SampledFilm(self._film, self._spp, lanes)
         #: medium around the sensor
         self.medium = sensor.get_medium()
         #: numbers of pixels, with those beside the image, and of camera samples
@@ -107,8 +109,10 @@ class FilmAdjoint(SampledCamera):
     pixels of an image of ``sensor`` to its camera samples.
     """
 
-    def __init__(self, sensor: mi.Sensor, grad: mi.TensorXf, seed: int, spp: int) -> None:
-        super().__init__(sensor, seed, spp)
+    def __init__(
+        self, sensor: mi.Sensor, grad: mi.TensorXf, seed: int, spp: int, lanes: int = LANES
+    ) -> None:
+        super().__init__(sensor, seed, spp, lanes)
         self.colour, self.alpha = _planes(self._film, grad)
 
     @property

@@ -62,11 +62,10 @@ class SceneState:
     ) -> None:
         self.integrator, self.scene, self.params = integrator, scene, params
         self._identity, self._revision = _variables(params), integrator.revision(scene)
-        cache = next(iter(integrator.caches.values()), None)
+        caches = [cache for cache in integrator.caches.values() if cache is not None]
+        counts = [cache.grid.voxel_count * values_per_voxel(cache) for cache in caches]
         #: number of values of the irradiance in each channel
-        self.voxels = 1
-        if cache is not None:
-            self.voxels = cache.grid.voxel_count * values_per_voxel(cache)
+        self.voxels = max(sum(counts), 1)
         self._adjoint: ParameterAdjoint | None = None
         #: state of the cache, derivatives of the parameters, and derivatives of images along them
         self._tangent: tuple[int, dict, ImageTangent] | None = None
@@ -101,7 +100,8 @@ class SceneState:
                 number = int(np.array(seed).ravel()[0])
                 keys = list(self._identity)
                 adjoint = self.integrator.adjoint(self.scene, self.params, keys, number)
-            found, fluence = adjoint.view(FilmAdjoint(sensor, grad, seed, spp))
+            film = FilmAdjoint(sensor, grad, seed, spp, adjoint.lanes)
+            found, fluence = adjoint.view(film)
             rest = {}
             if not shared and fluence is not None:
                 rest = adjoint.transport(fluence)

@@ -7,7 +7,10 @@ from collections.abc import Mapping
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.gradients.film import LUMINANCE
+from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.media.bake import children
 
 #: Roles of a parameter in a medium.
@@ -50,11 +53,40 @@ def roles_of(
 
     Raises IrrcacheError for any other parameter.
     """
+    nodes = nodes_of_medium(params, keys, medium, emission) | nodes_of_emitters(scene)
+    roles = {}
+    for key in keys:
+        node = params.properties[key][2]
+        if node == medium.phase_function() and node.class_name() == "HGPhaseFunction":
+            roles[key] = MEAN_COSINE
+        else:
+            roles[key] = role_of(params, key, nodes)
+    return roles
+
+
+def role_of(params: mi.SceneParameters, key: str, nodes: Mapping[mi.Object, object]) -> object:
+    """Return what ``nodes`` have for the object to which the parameter ``key`` belongs.
+
+    Raises IrrcacheError if there is none, or if the parameter is none of its values.
+    """
+    node, last = params.properties[key][2], key.rpartition(".")[2]
+    is_texels = node.class_name() == "EnvironmentMapEmitter" and last == "data"
+    if isinstance(node, mi.Emitter) and not is_texels:
+        refuse(key, f'"{last}" is not the radiance of the {node.class_name()}')
+    if node not in nodes or last not in ("data", "value"):
+        refuse(key, f"it belongs to a {node.class_name()}")
+    return nodes[node]
+
+
+def nodes_of_medium(
+    params: mi.SceneParameters, keys: list[str], medium: mi.Medium, emission: object = None
+) -> dict[mi.Object, str]:
+    """Return the roles of the volumes of a ``medium``, and of objects within these."""
     own = children(medium)
     volumes = {SIGMA_T: own["sigma_t"], ALBEDO: own["albedo"]}
     if isinstance(emission, mi.Volume):
         volumes[EMISSION] = emission
-    nodes: dict[mi.Object, str | mi.Emitter] = {}
+    nodes: dict[mi.Object, str] = {}
     for role, volume in volumes.items():
         for node in (volume, *children(volume).values()):
             if nodes.get(node, role) != role:
@@ -62,23 +94,16 @@ def roles_of(
                     _first_key_of(params, node, keys), f"both {nodes[node]} and {role} depend on it"
                 )
             nodes[node] = role
+    return nodes
+
+
+def nodes_of_emitters(scene: mi.Scene) -> dict[mi.Object, mi.Emitter]:
+    """Return the emitters of ``scene`` and the textures of their radiance."""
+    nodes: dict[mi.Object, mi.Emitter] = {}
     for emitter in scene.emitters():
         nodes[emitter] = emitter
         nodes |= {node: emitter for name, node in children(emitter).items() if name in RADIANCE}
-    roles = {}
-    for key in keys:
-        node = params.properties[key][2]
-        last = key.rpartition(".")[2]
-        is_texels = node.class_name() == "EnvironmentMapEmitter" and last == "data"
-        if isinstance(node, mi.Emitter) and not is_texels:
-            refuse(key, f'"{last}" is not the radiance of the {node.class_name()}')
-        if node == medium.phase_function() and node.class_name() == "HGPhaseFunction":
-            roles[key] = MEAN_COSINE
-            continue
-        if node not in nodes or last not in ("data", "value"):
-            refuse(key, f"it belongs to a {node.class_name()}")
-        roles[key] = nodes[node]
-    return roles
+    return nodes
 
 
 def _first_key_of(params: mi.SceneParameters, node: mi.Object, keys: list[str]) -> str:
@@ -119,3 +144,17 @@ def shaped_like(value: object, grad: mi.Float) -> object:
     return kind(
         *(dr.gather(mi.Float, grad, mi.UInt32(min(i, count - 1))) for i in range(len(value)))
     )
+
+
+def by_parameter(value: object, field: Field, grad: mi.Float) -> mi.Float:
+    """Return the derivative with respect to a parameter's ``value``, given the derivative ``grad``
+    with respect to the ``field`` computed from it: grids have a scale, and monochromatic variants
+    store the luminance of coloured data.
+    """
+    if field.grid is None:
+        return grad * dr.opaque(mi.Float, field.scale)
+    grad = grad * field.scale
+    if dr.is_tensor_v(value) and value.shape[3] != field.channels:
+        grad = interleaved([grad * share for share in LUMINANCE])
+    dr.eval(grad)
+    return grad

@@ -233,6 +233,19 @@ class CameraReplay:
         return total * adjoint, transmittance
 
     @symbolic
+    def transmittance(self, ray: mi.Ray3f, near: mi.Float, far: mi.Float, active: mi.Bool):
+        """Return the transmittance of rays between two distances, by the same rule."""
+        k, t, depth = mi.Float(0), mi.Float(near), mi.Spectrum(0)
+        active = mi.Bool(active) & (near < far)
+        while dr.hint(active, label="transmittance"):
+            end = minimum(dr.fma(k + 1, self.step, near), far)
+            depth += self.sigma_t(ray(0.5 * (t + end)), active) * (end - t)
+            t = end
+            k += 1
+            active &= t < far
+        return dr.exp(-depth)
+
+    @symbolic
     def replay(
         self,
         segments: RaySegments,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import mitsuba as mi
 import numpy as np
@@ -84,6 +84,8 @@ class Case:
     #: directions of the cache; 0: the default
     directions: int = 0
     parameters: tuple[str, ...] = ("sigma_t", "albedo")
+    #: further shapes, by their ids
+    objects: Callable[[], dict] = field(default=dict)
 
     def sigma_t(self) -> np.ndarray:
         """Extinction (z, y, x, channel)."""
@@ -140,6 +142,7 @@ class Case:
                 },
             }
             | self.emitters()
+            | self.objects()
         )
 
     def _medium(self, place: np.ndarray) -> dict:
@@ -241,6 +244,87 @@ def anisotropic() -> dict[str, Case]:
     }
 
 
+def ground(reflectance: object = 0.5) -> dict:
+    """A diffuse square below the medium."""
+    place = mi.ScalarTransform4f().translate([0, -1.3, 0]).rotate([1, 0, 0], -90).scale(6)
+    bsdf = {"type": "diffuse", "reflectance": reflectance}
+    return {"floor": {"type": "rectangle", "to_world": place, "bsdf": bsdf}}
+
+
+def distant() -> dict:
+    """A small object far from the medium, so that rays are traced."""
+    return {"far": {"type": "sphere", "center": [0, -3.0, 0], "radius": 0.05}}
+
+
+def room() -> dict:
+    """Five diffuse walls around the medium, open towards the camera."""
+    walls = {}
+    look = mi.ScalarTransform4f().look_at
+    for number, (name, normal) in enumerate({
+        "left": [1, 0, 0], "right": [-1, 0, 0], "bottom": [0, 1, 0], "top": [0, -1, 0],
+        "back": [0, 0, -1],
+    }.items()):  # fmt: skip
+        origin = [-1.5 * n for n in normal]
+        up = [0, 0, 1] if normal[1] else [0, 1, 0]
+        place = look(origin, [o + n for o, n in zip(origin, normal, strict=True)], up)
+        # Mitsuba merges shapes of equal BSDFs.
+        bsdf = {"type": "diffuse", "reflectance": 0.4 + 0.05 * number}
+        walls[name] = {"type": "rectangle", "to_world": place.scale(1.5), "bsdf": bsdf}
+    return walls
+
+
+def lamp() -> dict:
+    """A square lamp above the medium."""
+    place = mi.ScalarTransform4f().translate([0.2, 2.2, 0]).rotate([1, 0, 0], 90).scale(0.7)
+    light = {"type": "area", "radiance": {"type": "rgb", "value": [4.0, 3.0, 2.0]}}
+    return {"lamp": {"type": "rectangle", "to_world": place, "emitter": light}}
+
+
+def second_medium(away: float) -> dict:
+    """A homogeneous cube beside the medium, at a distance."""
+    place = mi.ScalarTransform4f().translate([-2.0 - away, 0, 0])
+    interior = {"type": "homogeneous", "sigma_t": 0.8, "albedo": 0.9}
+    shape = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": interior}
+    return {"other": shape}
+
+
+def surrounded() -> dict[str, Case]:
+    """Cases with surfaces, area emitters and several media.
+
+    The irradiance of the cache has random noise there, which differences of images share only in
+    part: it has many directions.
+    """
+    colour = {"type": "rgb", "value": [0.6, 0.5, 0.4]}
+    both = ("sigma_t", "albedo")
+    found = {
+        "ground, sky": Case(objects=ground, parameters=(*both, "floor")),
+        "ground, sky, 32^3": Case(cache=32, objects=ground),
+        "ground, sun": Case(emitters=_under(sun=SUN), objects=ground, parameters=(*both, "floor")),
+        "ground, sun, 32^3": Case(cache=32, emitters=_under(sun=SUN), objects=ground),
+        "ground, sky and sun, in colour": Case(
+            emitters=_under(sky=SKY, sun=SUN),
+            objects=lambda: ground(colour),
+            parameters=(*both, "floor", "sky", "sun"),
+        ),
+        "ground, point": Case(emitters=_under(point=POINT), objects=ground),
+        "distant object, empty voxels": Case(
+            empty_beyond=0.5, changed=(0.75, 0.85), objects=distant, parameters=("sigma_t",)
+        ),
+        "room, sky": Case(objects=room, parameters=(*both, "left")),
+        "lamp": Case(emitters=dict, objects=lamp, parameters=(*both, "lamp")),
+        "lamp over a ground": Case(
+            emitters=dict, objects=lambda: ground() | lamp(), parameters=(*both, "floor", "lamp")
+        ),
+        "two media, sky": Case(
+            objects=lambda: second_medium(0.5), parameters=(*both, "other.interior_medium.sigma_t")
+        ),
+        "two media side by side, sun": Case(
+            emitters=_under(sun=SUN), objects=lambda: second_medium(0.002)
+        ),
+    }
+    return {name: replace(case, directions=256) for name, case in found.items()}
+
+
 COLOURED = {"albedo": (0.6, 0.75, 0.85), "emitters": _under(sky=SKY)}
 CASES = {
     "sky, single": Case(max_depth=2),
@@ -298,4 +382,5 @@ CASES = {
     ),
     "alpha": Case(pixels="rgba", emitters=_under(sun=SUN)),
     **anisotropic(),
+    **surrounded(),
 }

@@ -37,9 +37,15 @@ class Comparison:
 
 
 def key_of(params: mi.SceneParameters, name: str) -> str:
-    """The key of a medium's parameter, or of the radiance of the emitter of this name."""
-    keys = (key for key in params.keys() if key.endswith((".value", ".data", ".g")))
-    (key,) = [key for key in keys if name in key.split(".")]
+    """The key of a parameter of the medium or of another object, part of which is ``name``.
+
+    If several fit, it is that of the first medium or of the radiance of an emitter.
+    """
+    keys = [key for key in params.keys() if key.endswith((".value", ".data", ".g"))]
+    keys = [key for key in keys if f".{name}." in f".{key}."]
+    if len(keys) > 1:
+        keys = [key for key in keys if key.startswith("shape.") or ".emitter." in key]
+    (key,) = keys
     return key
 
 

@@ -1,0 +1,456 @@
+"""Derivatives along paths through media with known fluence and between surfaces.
+
+A path starts at the camera, or in a voxel. It continues from surface to surface; on each segment
+the media add the radiance that they scatter, which their fluence determines, and attenuate what is
+behind. All segments of a path are stored, so that going back along it what is ahead of each of them
+is known (as in path replay backpropagation, Vicini, Speierer and Jakob 2021).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.gradients.emitters import pull
+from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, RaySegments
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_solid, power_heuristic
+
+#: Number of surfaces of a path, at most, and after which Russian roulette ends paths; smallest
+#: probability to continue.
+MOST_SURFACES, ROULETTE_AFTER, LEAST_CHANCE = 64, 4, 0.05
+#: Density of isotropic directions.
+UNIFORM = 1 / (4 * dr.pi)
+
+
+@dataclass
+class Start:
+    """Starts of paths.
+
+    Attributes:
+        ray: their first rays.
+        adjoint: derivative of the objective with respect to the radiance along the rays.
+        alpha: derivative with respect to what the rays see if they leave the scene: -1 times that
+            with respect to alpha; None without.
+        irradiance: derivative with respect to the irradiance of emitters at the origin of the rays,
+            which isotropic scattering there adds; None for rays of a camera.
+        rng: random number generator.
+    """
+
+    ray: mi.Ray3f
+    adjoint: mi.Spectrum
+    alpha: mi.Float | None
+    irradiance: mi.Spectrum | None
+    rng: mi.PCG32
+
+
+@dataclass
+class _Segment:
+    """A segment of paths: what it contributes, and what going back along it needs.
+
+    Attributes:
+        ray: the rays; ``distance`` to their ends.
+        offset: length of the first step in each medium, in steps.
+        weight: throughput at the start, times the derivative of the objective.
+        near, far, hit: for each medium, where the rays are in it.
+        scattered, before: for each medium, the radiance that it scatters into the rays, and the
+            transmittance of what is in front of it.
+        through: transmittance of all media.
+        end: the surface at the end.
+        emitted: weighted radiance of emitters that the ray hits; ``emitter_weight`` its weight.
+    """
+
+    ray: mi.Ray3f
+    distance: mi.Float
+    offset: mi.Float
+    weight: mi.Spectrum
+    near: list[mi.Float]
+    far: list[mi.Float]
+    hit: list[mi.Bool]
+    scattered: list[mi.Spectrum]
+    before: list[mi.Spectrum]
+    through: mi.Spectrum
+    end: mi.SurfaceInteraction3f
+    emitted: mi.Spectrum
+    emitter_weight: mi.Spectrum
+    #: contribution to alpha
+    escaped: mi.Spectrum
+
+    def gathered(self) -> mi.Spectrum:
+        """Return the weighted radiance that the media scatter into the ray."""
+        products = (b * s for b, s in zip(self.before, self.scattered, strict=True))
+        return self.weight * sum(products, mi.Spectrum(0))
+
+    def behind(self, number: int) -> mi.Spectrum:
+        """Return the weighted radiance that a medium and all behind it scatter into the ray."""
+        total = mi.Spectrum(0)
+        for near, before, scattered in zip(self.near, self.before, self.scattered, strict=True):
+            later = near >= self.near[number]
+            total += dr.select(later, before * scattered, 0)
+        return self.weight * total
+
+
+@dataclass
+class _Vertex:
+    """A surface at the end of a segment, or the start in a voxel (without ``incoming``).
+
+    Attributes:
+        shadow: ray to the sampled point of an emitter; ``length`` is its length.
+        direct: weighted radiance of the emitter that the vertex scatters along the path.
+        record, emitter: the sampled direction, and the weight of the emitter's radiance.
+        surface: the surface; None for a voxel.
+        next_direction, scattering: the direction of the next segment, and the BSDF there.
+        active: paths that have this vertex.
+    """
+
+    shadow: mi.Ray3f
+    length: mi.Float
+    direct: mi.Spectrum
+    record: mi.DirectionSample3f
+    emitter: mi.Spectrum
+    origin: mi.Interaction3f
+    surface: mi.SurfaceInteraction3f | None
+    towards: mi.Vector3f
+    direct_scattering: mi.Spectrum
+    active: mi.Bool
+    next_direction: mi.Vector3f | None = None
+    scattering: mi.Spectrum | None = None
+
+
+class MarchedMedia:
+    """Media with known fluence that lie apart, or side by side."""
+
+    def __init__(self, marches: Sequence[CameraReplay]) -> None:
+        self.marches = list(marches)
+
+    def spans(self, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool) -> tuple[list, list, list]:
+        """Return where rays of a length are in each medium, and whether they are."""
+        nears, fars, hits = [], [], []
+        for march in self.marches:
+            hit, near, far = march.medium.intersect(ray)
+            near, far = dr.maximum(near, 0), dr.minimum(far, distance)
+            hit &= active & (near < far)
+            nears.append(dr.select(hit, near, dr.inf))
+            fars.append(dr.select(hit, far, dr.inf))
+            hits.append(hit)
+        return nears, fars, hits
+
+    def march(
+        self, ray: mi.Ray3f, spans: tuple[list, list, list], offset: mi.Float
+    ) -> tuple[list[mi.Spectrum], list[mi.Spectrum], mi.Spectrum]:
+        """Return ``scattered``, ``before`` and ``through`` of `_Segment`."""
+        one = mi.Spectrum(dr.ones(mi.Float, dr.width(offset)))
+        scattered, transmittances = [], []
+        for march, near, far, hit in zip(self.marches, *spans, strict=True):
+            found = march.radiance(RaySegments(ray, near, far, one, offset, hit))
+            dr.eval(found)
+            scattered.append(found[0])
+            transmittances.append(found[1])
+        nears = spans[0]
+        before, through = [], mi.Spectrum(one)
+        for number, near in enumerate(nears):
+            passed = mi.Spectrum(one)
+            for other, (start, factor) in enumerate(zip(nears, transmittances, strict=True)):
+                if other != number:
+                    passed *= dr.select(start < near, factor, 1)
+            before.append(passed)
+            through *= transmittances[number]
+        dr.eval(before, through)
+        return scattered, before, through
+
+    def transmittance(self, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool) -> mi.Spectrum:
+        """Return the transmittance of all media up to a distance along rays."""
+        result = mi.Spectrum(1)
+        for march, near, far, hit in zip(
+            self.marches, *self.spans(ray, distance, active), strict=True
+        ):
+            result *= march.transmittance(ray, near, far, hit)
+        return result
+
+
+class PathAdjoint:
+    """Traces paths in ``scene`` between surfaces and through ``media``.
+
+    ``emitters`` and ``surfaces`` state whether derivatives with respect to the radiance of emitters
+    and to BSDFs are added to the gradients of their parameters; ``hide_emitters`` is the
+    integrator's property.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        media: MarchedMedia,
+        emitters: bool = False,
+        surfaces: bool = False,
+        hide_emitters: bool = False,
+    ) -> None:
+        self._scene, self._media, self._hides = scene, media, hide_emitters
+        self._emitters, self._surfaces = emitters, surfaces
+        self._segments: list[_Segment] = []
+        self._vertices: list[_Vertex | None] = []
+
+    # Forwards
+
+    def trace(self, start: Start) -> mi.Spectrum:
+        """Trace paths, store them, and return the weighted radiance along them."""
+        self._segments, self._vertices = [], []
+        ray, weight, rng = start.ray, mi.Spectrum(start.adjoint), start.rng
+        active, origin, total = mi.Bool(True), dr.zeros(mi.Interaction3f), mi.Spectrum(0)
+        density, vertex = mi.Float(0), None
+        if start.irradiance is not None:
+            origin = dr.zeros(mi.Interaction3f, dr.width(ray.d))
+            origin.p, density = ray.o, mi.Float(UNIFORM)
+            vertex, rng = self._start_in_voxel(origin, start.irradiance, rng)
+            total += vertex.direct
+        self._vertices.append(vertex)
+        for number in range(MOST_SURFACES):
+            is_first = number == 0 and start.irradiance is None
+            offset = 1 - rng.next_float32()
+            arrival = origin, density, is_first
+            alpha = start.alpha if is_first else None
+            segment = self._segment(ray, weight, arrival, offset, active, alpha)
+            self._segments.append(segment)
+            total += segment.gathered() + segment.emitted + segment.escaped
+            active = active & segment.end.is_valid()
+            vertex, ray, weight, density, active, rng = self._scatter(segment, number, active, rng)
+            origin = mi.Interaction3f(segment.end)
+            self._vertices.append(vertex)
+            total += vertex.direct
+            dr.eval(total, ray, weight, density, active, rng)
+            if not dr.any(active):
+                break
+        return total
+
+    def _start_in_voxel(
+        self, origin: mi.Interaction3f, irradiance: mi.Spectrum, rng: mi.PCG32
+    ) -> tuple[_Vertex, mi.PCG32]:
+        sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+        record, emitter, shadow, visible = self._emitter(origin, sample, mi.Bool(True))
+        other = dr.select(record.delta, 0, UNIFORM)
+        share = power_heuristic_or_one(record, other)
+        scale = irradiance * (visible * share)
+        vertex = _Vertex(
+            shadow, record.dist, scale * emitter, record, scale, origin, None, record.d,
+            mi.Spectrum(1), mi.Bool(True),
+        )  # fmt: skip
+        dr.eval(vertex.direct, vertex.emitter, vertex.shadow, rng)
+        return vertex, rng
+
+    def _emitter(
+        self, origin: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Ray3f, mi.Spectrum]:
+        """Sample an emitter: the record, radiance over density, shadow ray and transmittance."""
+        record, emitter = self._scene.sample_emitter_direction(origin, sample, False, active)
+        active = active & (record.pdf > 0) & (dr.max(dr.abs(emitter)) > 0)
+        shadow = mi.Ray3f(origin.spawn_ray_to(record.p))
+        shadow.d = record.d
+        shadow.maxt = dr.largest(mi.Float)
+        open_ = active & is_open(self._scene, mi.Ray3f(origin.spawn_ray_to(record.p)), active)
+        through = self._media.transmittance(shadow, record.dist, open_)
+        return record, emitter, shadow, dr.select(open_, through, 0)
+
+    def _segment(
+        self,
+        ray: mi.Ray3f,
+        weight: mi.Spectrum,
+        arrival: tuple,
+        offset: mi.Float,
+        active: mi.Bool,
+        alpha: mi.Float | None,
+    ) -> _Segment:
+        origin, density, is_first = arrival
+        end, distance = next_solid(self._scene, ray, active)
+        spans = self._media.spans(ray, distance, active)
+        dr.eval(end, distance, spans)
+        scattered, before, through = self._media.march(ray, spans, offset)
+        emitter = end.emitter(self._scene, active)
+        share = mi.Float(1)
+        if not is_first:
+            record = mi.DirectionSample3f(self._scene, end, origin)
+            other = self._scene.pdf_emitter_direction(origin, record, active)
+            share = dr.select(density > 0, power_heuristic(density, other), 1)
+        elif self._hides:
+            share = mi.Float(0)
+        emitter_weight = dr.select(active, weight * through * share, 0)
+        emitted = emitter_weight * emitter.eval(end, active)
+        escaped = mi.Spectrum(0)
+        if alpha is not None:
+            away = active & ~end.is_valid()
+            escaped = dr.select(away, through * (alpha / dr.size_v(mi.Spectrum)), 0)
+        dr.eval(emitted, emitter_weight, escaped)
+        return _Segment(
+            ray, distance, offset, weight, *spans, scattered, before, through, end, emitted,
+            emitter_weight, escaped,
+        )  # fmt: skip
+
+    def _scatter(
+        self, segment: _Segment, number: int, active: mi.Bool, rng: mi.PCG32
+    ) -> tuple[_Vertex, mi.Ray3f, mi.Spectrum, mi.Float, mi.Bool, mi.PCG32]:
+        """Scatter paths at the end of a segment; return the vertex and the next segment."""
+        si, bsdf = segment.end, segment.end.bsdf()
+        arriving = segment.weight * segment.through
+        context = mi.BSDFContext()
+        sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+        record, emitter, shadow, visible = self._emitter(si, sample, active)
+        towards = si.to_local(record.d)
+        value, other = bsdf.eval_pdf(context, si, towards, active)
+        share = power_heuristic_or_one(record, dr.select(record.delta, 0, other))
+        scale = dr.select(active, arriving * visible * share, 0)
+        choice, sample = (
+            rng.next_float32(),
+            mi.Point2f(rng.next_float32(), rng.next_float32()),
+        )
+        found, factor = bsdf.sample(context, si, choice, sample, active)
+        weight = arriving * factor
+        density = dr.select(mi.has_flag(found.sampled_type, mi.BSDFFlags.Delta), 0, found.pdf)
+        active = active & (dr.max(dr.abs(weight)) > 0)
+        chance = mi.Float(1)
+        if number >= ROULETTE_AFTER:
+            # Relative to the start of the path, whose weight is a derivative.
+            first = dr.max(dr.abs(self._segments[0].weight))
+            ratio = dr.max(dr.abs(weight)) / dr.select(first > 0, first, 1)
+            chance = dr.clip(ratio, LEAST_CHANCE, 0.95)
+        goes_on = rng.next_float32() < chance
+        vertex = _Vertex(
+            shadow, record.dist, scale * emitter * value, record, scale * value,
+            mi.Interaction3f(si), si, towards, value, active, found.wo, factor * found.pdf,
+        )  # fmt: skip
+        active = active & goes_on
+        weight = dr.select(active, weight / chance, 0)
+        ray = mi.Ray3f(si.spawn_ray(si.to_world(found.wo)))
+        dr.eval(vertex.direct, vertex.emitter, vertex.shadow, vertex.scattering)
+        return vertex, ray, weight, density, active, rng
+
+    def largest(self) -> float:
+        """Return an upper bound of the weighted radiance that any part of a path has ahead."""
+        total = mi.Spectrum(0)
+        for segment in self._segments:
+            total += dr.abs(segment.gathered()) + dr.abs(segment.emitted) + dr.abs(segment.weight)
+        for vertex in self._vertices:
+            total += 0 if vertex is None else dr.abs(vertex.direct)
+        return float(dr.max(dr.max(total))[0])
+
+    # Back
+
+    def add(self, splats: list[CameraSplats], without_first: int | None = None) -> None:
+        """Go back along the paths that `trace` stored, and add derivatives to ``splats``.
+
+        ``without_first`` is a medium that the first segments skip.
+        """
+        rest = mi.Spectrum(0)
+        for number in range(len(self._segments) - 1, -1, -1):
+            segment, vertex = self._segments[number], self._vertices[number + 1]
+            self._add_vertex(vertex, rest, splats)
+            rest = rest + vertex.direct
+            skipped = without_first if number == 0 else None
+            self._add_segment(segment, rest, splats, skipped)
+            rest = rest + segment.gathered() + segment.emitted + segment.escaped
+            dr.eval(rest)
+        if self._vertices[0] is not None:
+            self._add_vertex(self._vertices[0], mi.Spectrum(0), splats)
+
+    def _add_segment(
+        self,
+        segment: _Segment,
+        rest: mi.Spectrum,
+        splats: list[CameraSplats],
+        skipped: int | None,
+    ) -> None:
+        behind = rest + segment.emitted + segment.escaped
+        for number, march in enumerate(self._media.marches):
+            if number == skipped:
+                continue
+            passed = segment.weight * segment.before[number]
+            near, far, hit = segment.near[number], segment.far[number], segment.hit[number]
+            rays = RaySegments(segment.ray, near, far, passed, segment.offset, hit)
+            ahead = segment.behind(number) + behind
+            march.replay(rays, ahead, mi.Spectrum(0), splats[number])
+        dr.eval()
+        if self._emitters:
+            with dr.resume_grad():
+                value = segment.end.emitter(self._scene).eval(segment.end)
+                pull(value, segment.emitter_weight)
+
+    def _add_vertex(self, vertex: _Vertex, rest: mi.Spectrum, splats: list[CameraSplats]) -> None:
+        """Add derivatives through the direct radiance of emitters, and with respect to the BSDF.
+
+        ``rest`` is the weighted radiance of all further segments.
+        """
+        none = mi.Spectrum(dr.zeros(mi.Float, dr.width(vertex.length)))
+        offset = dr.ones(mi.Float, dr.width(vertex.length))
+        lit = vertex.active & (dr.max(dr.abs(vertex.direct)) > 0)
+        spans = self._media.spans(vertex.shadow, vertex.length, lit)
+        for march, near, far, hit, own in zip(self._media.marches, *spans, splats, strict=True):
+            if own.sigma_t is not None:
+                rays = RaySegments(vertex.shadow, near, far, none, offset, hit)
+                attenuation = CameraSplats(own.sigma_t, None, None)
+                march.replay(rays, vertex.direct + none, none, attenuation)
+        dr.eval()
+        if self._emitters:
+            with dr.resume_grad():
+                record = vertex.record
+                value = self._scene.eval_emitter_direction(vertex.origin, record, lit)
+                pull(
+                    value / dr.select(record.pdf > 0, record.pdf, 1),
+                    dr.select(lit, vertex.emitter, 0),
+                )
+        if self._surfaces and vertex.surface is not None:
+            self._add_surface(vertex, rest, lit)
+
+    def _add_surface(self, vertex: _Vertex, rest: mi.Spectrum, lit: mi.Bool) -> None:
+        context, si = mi.BSDFContext(), vertex.surface
+
+        def share(value: mi.Spectrum, factor: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
+            return dr.select(active & (factor != 0), value / dr.select(factor != 0, factor, 1), 0)
+
+        pairs = (
+            (vertex.towards, share(vertex.direct, vertex.direct_scattering, lit)),
+            (vertex.next_direction, share(rest, vertex.scattering, vertex.active)),
+        )
+        for direction, adjoint in pairs:
+            dr.eval(adjoint)
+            with dr.resume_grad():
+                pull(si.bsdf().eval(context, si, direction, vertex.active), adjoint)
+
+
+def power_heuristic_or_one(record: mi.DirectionSample3f, other: mi.Float) -> mi.Float:
+    """Return the weight of a sample of an emitter; 1 for emitters that nothing else can hit."""
+    return dr.select(record.delta, 1, power_heuristic(record.pdf, other))
+
+
+@symbolic
+def next_solid(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
+    """Return the first surface along rays that is more than the boundary of a medium, and the
+    distance to it (infinite if there is none).
+    """
+    si, ahead, active = dr.zeros(mi.SurfaceInteraction3f), mi.Ray3f(ray), mi.Bool(active)
+    found, crossings = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d)), mi.UInt32(0)
+    found.wi = -ray.d
+    found.t = dr.inf
+    while dr.hint(active, label="next surface"):
+        si = scene.ray_intersect(ahead, active)
+        solid = active & si.is_valid() & is_solid(si)
+        found = dr.select(solid, si, found)
+        ahead = si.spawn_ray(ahead.d)
+        crossings += 1
+        active &= si.is_valid() & ~solid & (crossings < MOST_CROSSINGS)
+    distance = dr.select(found.is_valid(), dr.dot(found.p - ray.o, ray.d), dr.inf)
+    return found, distance
+
+
+@symbolic
+def is_open(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
+    """Return whether no surface but boundaries of media is between the ends of rays."""
+    ahead, active, result = mi.Ray3f(ray), mi.Bool(active), mi.Bool(active)
+    target, crossings = ray(ray.maxt), mi.UInt32(0)
+    while dr.hint(active, label="to an emitter"):
+        si = scene.ray_intersect(ahead, active)
+        hit = active & si.is_valid()
+        result &= ~(hit & is_solid(si))
+        ahead = si.spawn_ray_to(target)
+        crossings += 1
+        active &= hit & result & (crossings < MOST_CROSSINGS)
+    return result

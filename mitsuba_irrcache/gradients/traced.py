@@ -1,0 +1,219 @@
+"""Derivatives of images of scenes with surfaces and several media, by parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.jit import concatenated
+from mitsuba_irrcache.gradients.film import FilmAdjoint
+from mitsuba_irrcache.gradients.medium import field_of
+from mitsuba_irrcache.gradients.parameters import (
+    ALBEDO,
+    SIGMA_T,
+    by_parameter,
+    channels_of,
+    nodes_of_emitters,
+    nodes_of_medium,
+    refuse,
+    refuse_all,
+    role_of,
+    shaped_like,
+)
+from mitsuba_irrcache.gradients.replay import CameraSplats
+from mitsuba_irrcache.gradients.surroundings import LANES, CoupledMedium, Surroundings
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, position_of
+from mitsuba_irrcache.lights.falloff import edges_away
+from mitsuba_irrcache.media.bake import children
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
+from mitsuba_irrcache.scene.compile import media_of
+
+#: BSDFs with respect to whose reflectance there are derivatives, and BSDFs that contain others.
+DIFFUSE, NESTING = "SmoothDiffuse", ("TwoSidedBRDF",)
+
+
+def check(parts: list[CachedMedium], keys: list[str]) -> None:
+    """Raise IrrcacheError for scenes with surfaces or several media without gradients."""
+    description, settings = parts[0].description, parts[0].settings
+    if settings.max_depth >= 0:
+        refuse_all(
+            keys,
+            f"max_depth is {settings.max_depth} and there are surfaces, area lights or several "
+            "media",
+            "Set max_depth to -1",
+        )
+    if len(parts) < len(description.media.grids):
+        refuse_all(keys, "a medium is not visible to the camera", "Remove that medium")
+    for part in parts:
+        _check_medium(part, keys)
+    for part in parts:
+        for other in parts:
+            if part is not other and _reaches_into(part, other):
+                refuse_all(
+                    keys,
+                    f'medium "{part.medium.name}" reaches into medium "{other.medium.name}"',
+                    "Move them apart",
+                )
+
+
+def _check_medium(part: CachedMedium, keys: list[str]) -> None:
+    medium, name = part.medium, f'medium "{part.medium.name}"'
+    among = "among surfaces, area lights or several media"
+    if not medium.phase.is_isotropic:
+        refuse_all(keys, f"{name} scatters anisotropically {among}", "Remove its phase function")
+    if medium.emission is not None:
+        refuse_all(keys, f"{name} is emissive {among}", "Remove the emission")
+    if medium.refracts:
+        refuse_all(keys, f"the boundary of {name} refracts", "Give it a null BSDF")
+    if medium.boundary.kind not in ("box", "sphere") or not medium.has_exact_boundary:
+        refuse_all(
+            keys, f"the boundary of {name} is neither a box nor a sphere", "Use one of these"
+        )
+    if part.cache is None:
+        refuse_all(keys, f"{name} is opaque and homogeneous, and has no cache", "Set resolution")
+    if not part.solver.has_gradients:
+        refuse_all(keys, f'the solver is "{part.solver.name}"', "Set solver to sweep")
+    if part.cache.voxel_classes is not None:
+        refuse_all(keys, f"a surface reaches into {name}", "Move it out")
+    for light in part.description.emitters.of(*POINT_LIKE):
+        if edges_away(position_of(light)[:, None], part.cache.grid) < 1:
+            refuse_all(keys, f'emitter "{light.id()}" is in {name} {among}', "Move it out")
+
+
+def _reaches_into(part: CachedMedium, other: CachedMedium) -> bool:
+    grid = part.cache.grid
+    p = grid.centers(dr.arange(mi.UInt32, grid.voxel_count))
+    return bool(dr.any(part.medium.contains(p) & other.medium.contains(p)))
+
+
+class TracedAdjoint:
+    """Derivatives of objectives of images of ``scene`` with respect to the parameters ``keys``.
+
+    The interface is that of `ParameterAdjoint`. ``parts`` are all media of the scene, with their
+    caches; ``step`` and ``hide_emitters`` the integrator's properties; ``seed`` determines random
+    numbers.
+    """
+
+    #: camera samples of a launch
+    lanes = LANES
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        params: mi.SceneParameters,
+        keys: list[str],
+        parts: list[CachedMedium],
+        image: tuple[float, bool],
+        seed: int,
+    ) -> None:
+        self._scene, self._params, self._parts, self._seed = scene, params, parts, seed
+        self._keys, (self._step, self._hides) = keys, image
+        media = list(media_of(scene))
+        self._roles = roles_among(params, keys, [media[p.medium.number] for p in parts], scene)
+
+    def view(self, film: FilmAdjoint) -> tuple[dict[str, object], list[mi.Float] | None]:
+        """Return derivatives and adjoint fluence as `ParameterAdjoint.view`; the fluence of all
+        media follows each other.
+        """
+        if film.largest == 0:
+            return {}, None
+        splats, fluence = self._surroundings.view(film)
+        joined = [concatenated(list(channels)) for channels in zip(*fluence, strict=True)]
+        return self._by_parameters(splats), joined
+
+    def transport(self, fluence: list[mi.Float]) -> dict[str, object]:
+        """Return the derivatives as `ParameterAdjoint.transport`."""
+        media = self._surroundings.media
+        counts = [medium.grid.voxel_count for medium in media]
+        camera, start = [], 0
+        for medium, count in zip(media, counts, strict=True):
+            place = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+            camera.append([dr.gather(mi.Float, f, place) for f in fluence[: medium.channels]])
+            start += count
+        return self._by_parameters(self._surroundings.transported(camera))
+
+    def along(self, changes: Mapping[str, object]) -> None:
+        """Refuse forward mode."""
+        refuse_all(
+            list(changes),
+            "dr.forward was called, and there are surfaces, area lights or several media",
+            "Call dr.backward on a loss",
+        )
+
+    @cached_property
+    def _surroundings(self) -> Surroundings:
+        wanted: list[dict[str, int]] = [{} for _ in self._parts]
+        for key, role in self._roles.items():
+            if isinstance(role, tuple):
+                number, name = role
+                field = field_of(self._parts[number].medium, name)
+                own = field.channels if field.grid is not None else channels_of(self._params[key])
+                wanted[number][name] = max(wanted[number].get(name, 1), own)
+        media = [
+            CoupledMedium(self._scene, part, own, self._step, self._seed)
+            for part, own in zip(self._parts, wanted, strict=True)
+        ]
+        roles = self._roles.values()
+        kinds = (
+            any(isinstance(role, mi.Emitter) for role in roles),
+            any(isinstance(role, mi.BSDF) for role in roles),
+        )
+        return Surroundings(self._scene, media, self._hides, kinds, self._seed)
+
+    def _by_parameters(self, splats: list[CameraSplats]) -> dict[str, object]:
+        result = {}
+        names = {SIGMA_T: "sigma_t", ALBEDO: "albedo"}
+        for key, role in self._roles.items():
+            if not isinstance(role, tuple):
+                continue  # accumulated in Dr.Jit's graph
+            number, name = role
+            field, value = field_of(self._parts[number].medium, name), self._params[key]
+            found = getattr(splats[number], names[name]).values()
+            result[key] = shaped_like(value, by_parameter(value, field, found))
+        return result
+
+
+def roles_among(
+    params: mi.SceneParameters, keys: list[str], media: list[mi.Medium], scene: mi.Scene
+) -> dict[str, object]:
+    """Return the role of each of the parameters ``keys``, by key.
+
+    A role is the number of one of the ``media`` with `SIGMA_T` or `ALBEDO`; the emitter whose
+    radiance the parameter is; or the diffuse BSDF whose reflectance it is.
+
+    Raises IrrcacheError for any other parameter.
+    """
+    nodes: dict[mi.Object, object] = dict(nodes_of_emitters(scene))
+    for number, medium in enumerate(media):
+        own = nodes_of_medium(params, keys, medium)
+        for node, role in own.items():
+            if isinstance(nodes.get(node), tuple):
+                refuse(_key_of(params, keys, node), "several media depend on it")
+            nodes[node] = number, role
+    for shape in scene.shapes():
+        if shape.bsdf() is not None:
+            nodes |= _reflectances(shape.bsdf())
+    roles = {key: role_of(params, key, nodes) for key in keys}
+    for key, role in roles.items():
+        if isinstance(role, mi.BSDF) and not float(np.min(np.array(params[key]))) > 0:
+            refuse(key, "it is 0 somewhere, where paths end; start with a small positive value")
+    return roles
+
+
+def _reflectances(bsdf: mi.BSDF) -> dict[mi.Object, mi.BSDF]:
+    """Return the textures of the reflectance of diffuse BSDFs."""
+    own = children(bsdf)
+    if bsdf.class_name() in NESTING:
+        return {k: v for nested in own.values() for k, v in _reflectances(nested).items()}
+    if bsdf.class_name() != DIFFUSE:
+        return {}
+    texture = own["reflectance"]
+    return dict.fromkeys((texture, *children(texture).values()), bsdf)
+
+
+def _key_of(params: mi.SceneParameters, keys: list[str], node: mi.Object) -> str:
+    return next((key for key in keys if params.properties[key][2] == node), keys[0])

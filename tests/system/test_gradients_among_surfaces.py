@@ -1,0 +1,171 @@
+"""Gradients in scenes with surfaces, area emitters and several media."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from experiments.validation.gradients.cases import CASES, Case, distant, ground
+from experiments.validation.gradients.differences import compare, gradients, key_of, pixel_weights
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.gradients import surroundings
+
+#: Largest relative error of directional derivatives, and the least cosine. The differences
+#: themselves have a noise of 1 to 2 % (standard deviation over seeds of the cache).
+ERROR, COSINE = 0.05, 0.998
+PERTURBATIONS = 2
+
+
+@pytest.fixture
+def fewer_paths(monkeypatch):
+    monkeypatch.setattr(surroundings, "RAYS", 1 << 18)
+    monkeypatch.setattr(surroundings, "EXCHANGED", 1 << 16)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("ground, sky", ("sigma_t", "floor")),
+        ("lamp", ("albedo", "lamp")),
+        ("two media, sky", ("sigma_t", "other.interior_medium.sigma_t")),
+        ("distant object, empty voxels", ("sigma_t",)),
+    ],
+)
+def test_gradients_are_those_of_the_image(mono, name, parameters):
+    case = CASES[name]
+    scene = case.load()
+    weights = pixel_weights(scene)
+    found = gradients(scene, parameters, weights)
+    for parameter, gradient in found.items():
+        result = compare(scene, case, parameter, weights, gradient, PERTURBATIONS)
+        assert result.error < ERROR, parameter
+        assert result.cosine > COSINE, parameter
+
+
+def test_gradients_in_colour_are_those_of_the_image(rgb):
+    """By the reflectance of the ground, and by the irradiance of the sun."""
+    case = CASES["ground, sky and sun, in colour"]
+    scene = case.load()
+    weights = pixel_weights(scene)
+    names = ("floor", "sun")
+    for parameter, gradient in gradients(scene, names, weights).items():
+        result = compare(scene, case, parameter, weights, gradient)
+        assert result.error < ERROR, parameter
+
+
+def test_a_distant_object_changes_nothing(mono):
+    """Paths from the voxels have the derivatives that ordinates have without surfaces."""
+    names, found = ("sigma_t", "albedo"), []
+    for objects in (dict, distant):
+        scene = Case(objects=objects).load()
+        found.append(gradients(scene, names, pixel_weights(scene)))
+    smooth = np.array(Case().sigma_t(), dtype=np.float64)
+    for name in names:
+        isolated, traced = ((each[name] * smooth).sum() for each in found)
+        assert traced == pytest.approx(isolated, rel=0.02)
+
+
+# Interface
+
+
+def attached(case: Case, name: str = "sigma_t") -> tuple[mi.Scene, mi.SceneParameters, str]:
+    scene = case.load()
+    params = mi.traverse(scene)
+    key = key_of(params, name)
+    params[key] = type(params[key])(dr.detach(params[key]))
+    dr.enable_grad(params[key])
+    params.update()
+    return scene, params, key
+
+
+def gradient_of(case: Case, seed: int, **options) -> np.ndarray:
+    scene, params, key = attached(case)
+    dr.backward(dr.mean(dr.square(mi.render(scene, params, spp=4, seed=seed, **options) - 0.3)))
+    return np.array(dr.grad(params[key]))
+
+
+SMALL = Case(data=6, cache=6, objects=ground)
+
+
+def test_the_same_seed_gives_the_same_bits(rgb, fewer_paths):
+    first, again, other = (gradient_of(SMALL, seed) for seed in (1, 1, 2))
+    assert first.tobytes() == again.tobytes()
+    assert first.tobytes() != other.tobytes()
+
+
+def test_views_share_the_adjoint_solve(rgb, fewer_paths, monkeypatch):
+    calls, solved = [], surroundings.Surroundings._solved
+    monkeypatch.setattr(
+        surroundings.Surroundings, "_solved", lambda *args: calls.append(args) or solved(*args)
+    )
+    scene, params, _ = attached(SMALL)
+    images = [mi.render(scene, params, spp=4, seed=seed) for seed in (1, 2)]
+    dr.backward(sum(dr.mean(image) for image in images))
+    assert len(calls) == 1
+
+
+def test_numbers_are_finite_with_black_matter_and_white_walls(rgb, fewer_paths):
+    for albedo, reflectance in ((0.0, 1.0), (0.9, 1.0)):
+        case = Case(data=6, cache=6, albedo=(albedo,), objects=lambda r=reflectance: ground(r))
+        scene = case.load()
+        found = gradients(scene, ("sigma_t", "albedo", "floor"), pixel_weights(scene), spp=4)
+        assert all(np.isfinite(values).all() for values in found.values())
+        assert all(np.abs(values).max() > 0 for values in found.values())
+
+
+# What is refused
+
+
+def refused(case: Case, suffix: str, **properties) -> str:
+    scene = case.load(**properties)
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if k.endswith(suffix)]
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(IrrcacheError) as error:
+        dr.backward(dr.mean(mi.render(scene, params, spp=1)))
+    assert f'"{key}"' in str(error.value) and "prbvolpath" in str(error.value)
+    return str(error.value)
+
+
+INSIDE = {"ball": {"type": "sphere", "radius": 0.3}}
+
+
+@pytest.mark.parametrize(
+    ("case", "suffix", "properties", "reason"),
+    [
+        (SMALL, "sigma_t.data", {"max_depth": 2}, "max_depth is 2"),
+        (SMALL, "sigma_t.data", {"solver": "path", "cache_spp": 8}, 'the solver is "path"'),
+        (SMALL, "floor.to_world", {}, "it belongs to a"),
+        (Case(data=6, cache=6, objects=ground, g=0.3), "sigma_t.data", {}, "anisotropically"),
+        (Case(data=6, cache=6, objects=lambda: INSIDE), "sigma_t.data", {}, "surface reaches into"),
+        (
+            Case(data=6, cache=6, objects=lambda: ground(0.0)),
+            "floor.bsdf.reflectance.value",
+            {},
+            "it is 0 somewhere",
+        ),
+    ],
+)
+def test_what_has_no_gradients_is_refused_by_name(rgb, case, suffix, properties, reason):
+    assert reason in refused(case, suffix, **properties)
+
+
+def test_forward_mode_is_refused(rgb, fewer_paths):
+    scene, params, _ = attached(SMALL)
+    with pytest.raises(IrrcacheError, match=r"sigma_t\.data.*dr\.forward was called"):
+        dr.forward_to(mi.render(scene, params, spp=1))
+
+
+def test_media_that_lie_within_each_other_are_refused(rgb):
+    inner = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5}
+    ball = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "null"}, "interior": inner}
+    scene = Case(data=6, cache=6, objects=lambda: {"inner": ball}).load(solver="auto")
+    params = mi.traverse(scene)
+    key = key_of(params, "sigma_t")
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises((IrrcacheError, RuntimeError), match="irrcache"):
+        dr.backward(dr.mean(mi.render(scene, params, spp=1)))
