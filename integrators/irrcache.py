@@ -79,10 +79,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
          0: chosen for an estimated error of 0.5 % of the mean radiance (``path``: 1 %): the
          resolution of the data, up to six times as many voxels along each axis if they are
-         optically thick, at least 32 along the longest side (``path``: 16), up to 64 or 128 if the
-         contrast is high or the boundary cuts through dense regions; fewer in smooth data under
-         environments without bright regions; at most 2^25 in total, for
-         ``path`` 128 along a side, and 32 to 64 with surfaces or several media. An opaque
+         optically thick, at least 32 along the longest side (48 around emitters, ``path``: 16), up
+         to 64 or 128 if the contrast is high or the boundary cuts through dense regions; fewer in
+         smooth data under environments without bright regions; at most 2^25 in total, for ``path``
+         128 along a side, and 32 to 64 with surfaces or several media. An opaque
          homogeneous medium in a box or sphere has no cache: its radiance is that of a half-space.
          (Default: 0)
 
@@ -105,10 +105,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
          of 8 samples or 32 to 256 directions. These are directions of scattering: the pass that
          solves, suns, samples of an environment and entry from surfaces come on top;
-         0: 128 directions, 64 with surfaces (256 for sharp phase functions), twice as many for
-         single scattering with an isotropic phase function, 64 for more orders of it in uniform
-         light; 16 to 256 samples, about 2^24 for all voxels, 2^22 with surfaces.
-         (Default: 0)
+         0: 128 directions, 64 with surfaces unless emitters are in the medium (256 for sharp phase
+         functions), twice as many for single scattering with an isotropic phase function, 64 for
+         more orders of it in uniform light; 16 to 256 samples, about 2^24 for all voxels, 2^22 with
+         surfaces. (Default: 0)
 
      * - cache_seed
        - |int|

@@ -212,14 +212,28 @@ def _crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
 
 
 def _check_normals(scene: mi.Scene, shape: mi.Shape, name: str) -> None:
-    """Reject a convex shape whose normals do not all point outwards."""
+    """Reject a convex shape whose normals do not all point outwards.
+
+    Rays tell inwards from outwards by their majority only: behind a wall that touches the shape,
+    Mitsuba's ray offset steps over its boundary.
+    """
     inwards, _ = orientation(scene, shape)
-    if inwards > MAX_INWARD_SHARE:
+    mixed = shape.is_mesh() and not _is_consistently_wound(shape)
+    if inwards > 0.5 or (mixed and inwards > MAX_INWARD_SHARE):
         some = "the normals" if inwards > 1 - MAX_INWARD_SHARE else f"{inwards:.0%} of the normals"
         raise UnsupportedSceneError(
             f"irrcache: {some} of {name} point inwards, so Mitsuba puts its interior medium "
             "outside of it; mirror its to_world once more (or drop flip_normals)."
         )
+
+
+def _is_consistently_wound(mesh: mi.Mesh) -> bool:
+    """Return whether all triangles of a convex mesh have the same side towards its centre."""
+    values = mi.traverse(mesh)
+    vertices = np.array(values["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    a, b, c = vertices[np.array(values["faces"]).reshape(-1, 3).T]
+    volume = np.einsum("ij,ij->i", a - vertices.mean(axis=0), np.cross(b - a, c - a))
+    return bool((volume >= 0).all() or (volume <= 0).all())
 
 
 def box_frame(vertices: np.ndarray) -> np.ndarray | None:

@@ -31,6 +31,7 @@ class MediumContext(Immutable):
         refracts: whether the boundary refracts radiance (a dielectric, not a null interface).
         detail: how much the incident radiance varies with position and direction; SHARP if
             unknown.
+        holds_emitters: whether emitting shapes are in the medium or touch it.
     """
 
     def __init__(
@@ -43,10 +44,12 @@ class MediumContext(Immutable):
         has_exact_boundary: bool = True,
         refracts: bool = False,
         detail: Detail = Detail.SHARP,
+        holds_emitters: bool = False,
     ) -> None:
         self.pointer, self.number, self.others = pointer, number, others
         self.is_isolated, self.has_exact_boundary = is_isolated, has_exact_boundary
         self.refracts, self.detail = refracts, detail
+        self.holds_emitters = holds_emitters
 
     def among(self, others: tuple[MediumGrid, ...]) -> MediumContext:
         """Return a copy with these ``others``."""
@@ -135,6 +138,10 @@ class MediumGrid(Immutable):
     @property
     def has_exact_boundary(self) -> bool:
         return self.context.has_exact_boundary
+
+    @property
+    def holds_emitters(self) -> bool:
+        return self.context.holds_emitters
 
     @property
     def refracts(self) -> bool:

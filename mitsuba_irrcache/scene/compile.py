@@ -111,6 +111,17 @@ def _detail(scene: mi.Scene, emission: Emission | None, max_depth: int) -> Detai
     return detail_of(scene.emitters())
 
 
+def _holds_emitters(scene: mi.Scene, frame: np.ndarray) -> bool:
+    """Return whether the bounding box of any emitting shape meets that of the cube [-1, 1]^3 mapped
+    by ``frame``.
+    """
+    reach = np.abs(frame[:3, :3]).sum(axis=1)
+    lower, upper = frame[:3, 3] - reach, frame[:3, 3] + reach
+    shapes = (emitter.get_shape() for emitter in scene.emitters())
+    boxes = (shape.bbox() for shape in shapes if shape is not None)
+    return any((np.array(b.min) <= upper).all() and (np.array(b.max) >= lower).all() for b in boxes)
+
+
 def _has_surfaces(scene: mi.Scene) -> bool:
     """Return whether any shape is more than the boundary of a medium."""
     return any(
@@ -148,7 +159,8 @@ def _baked(
         exact = _exact_boundary(scene, filled)
         pointer = mi.MediumPtr(medium)
         dr.make_opaque(pointer)
-        grid = bake(medium, exact or Boundary("box", _extent(medium, filled))).replaced(
+        boundary = exact or Boundary("box", _extent(medium, filled))
+        grid = bake(medium, boundary).replaced(
             name=_unique_name(medium, [g.name for g in grids]),
             emission=emission,
             context=MediumContext(
@@ -158,6 +170,7 @@ def _baked(
                 has_exact_boundary=exact is not None,
                 refracts=any(refracts(shape) for shape in filled),
                 detail=_detail(scene, emission, max_depth) if is_isolated else Detail.SHARP,
+                holds_emitters=_holds_emitters(scene, boundary.to_world),
             ),
         )
         grids.append(grid)

@@ -68,6 +68,10 @@ SMOOTH_ERROR, DEPTH_ERROR, DETAIL_ERROR, MOST_DETAIL_DEPTH = 0.4, 0.3, 7.0, 0.25
 UNRESOLVED_ERROR, LARGE_UNRESOLVED, MOST_FOR_DETAIL = 6.0, 1.0, 1 << 22
 #: Error [%] above which the warning is logged.
 NOTABLE_UNRESOLVED = 0.8
+#: Ratio of the minimum resolution of media that hold emitting shapes to that of others. The voxels
+#: at a luminous surface are too dark, because irradiance is extrapolated to it: the mean of a foggy
+#: room is off by -0.55 % with 32 voxels and -0.17 % with 48, for 1.2 times the time.
+FINER_AROUND_EMITTERS = 1.5
 #: Ratio between the resolutions that are tried, the largest of them in units of the resolution
 #: chosen otherwise, and number of positions at which detail is measured.
 SIZE_RATIO, LARGEST_SHARE, POSITIONS = 2**0.25, 0.9, 1 << 20
@@ -151,7 +155,11 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
     lengths = np.linalg.norm(frame[:3, :3], axis=0)
     mean, border = _colliding_extinction(medium), _border_extinction(medium)
     # Number of voxels along x, y, z that each criterion requires.
-    wanted = {f"at least {rule.fewest}": rule.fewest * lengths / lengths.max()}
+    fewest = f"at least {rule.fewest}"
+    wanted = {fewest: rule.fewest * lengths / lengths.max()}
+    if medium.holds_emitters:
+        count = round(FINER_AROUND_EMITTERS * rule.fewest)
+        wanted[f"at least {count} around emitters"] = count * lengths / lengths.max()
     if data is not None:
         ratio = np.ones(3)
         if rule.refines_dense_data:
@@ -186,7 +194,7 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
         if bound < 1:
             sides, reason = sides * bound, message
     if rule.larger_in_smooth_light and data is not None:
-        least = np.maximum(wanted[f"at least {rule.fewest}"], wanted[at_boundary])
+        least = np.maximum(wanted[fewest], wanted[at_boundary])
         smooth = _size_in_smooth_light(medium, np.minimum(least, sides), sides)
         if smooth is not None:
             sides, reason = smooth, "as smooth light and data permit"

@@ -32,9 +32,9 @@ EMITTERS = frozenset(
         EmitterKind.AREA,
     )
 )
-#: Default number of directions per voxel: for isolated media, and among surfaces, where camera
-#: paths add noise. It is doubled for single isotropic scattering, where directions are cheaper and
-#: their noise is not blurred by further orders.
+#: Default number of directions per voxel: for isolated media and those that hold emitters, and
+#: among other surfaces, where camera paths add noise. It is doubled for single isotropic
+#: scattering, where directions are cheaper and their noise is not blurred by further orders.
 DEFAULT_DIRECTIONS, DIRECTIONS_AMONG_SURFACES = 128, 64
 #: The same for isotropic scattering in a constant environment: errors are at most 1.5 times those
 #: with 128.
@@ -126,7 +126,8 @@ class SweepSolver(Solver):
         if medium.detail is Detail.UNIFORM and medium.phase.is_isotropic:
             return DIRECTIONS_IN_UNIFORM_LIGHT
         once = max_depth == 2 and medium.phase.is_isotropic
-        count = DEFAULT_DIRECTIONS if medium.is_isolated else DIRECTIONS_AMONG_SURFACES
+        few = not (medium.is_isolated or medium.holds_emitters)
+        count = DIRECTIONS_AMONG_SURFACES if few else DEFAULT_DIRECTIONS
         return 2 * count if once else count
 
     @classmethod

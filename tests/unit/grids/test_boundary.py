@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import UnsupportedSceneError
-from mitsuba_irrcache.grids.boundary import Boundary, boundary_of
+from mitsuba_irrcache.grids.boundary import Boundary, boundary_of, orientation
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -103,4 +103,42 @@ def test_inward_normals_are_refused(scenes):
     shape["to_world"] = mi.ScalarTransform4f(np.diag([-1.0, 1, 1, 1]))
     scene = scenes.load({"type": "volpath"}, shape)
     with pytest.raises(UnsupportedSceneError, match="normals"):
+        boundary_of(scene, scene.shapes()[0])
+
+
+def test_walls_that_touch_a_box(scenes):
+    """Behind a wall that touches a face, Mitsuba's ray offset steps over the face, so that some
+    rays only leave the box: its normals are not at fault.
+    """
+    look = mi.ScalarTransform4f().look_at
+    walls = {
+        f"wall{i}": {
+            "type": "rectangle",
+            "to_world": look([0, y, 0], [0, 0, 0.001], [0, 0, 1]).scale(2),
+        }
+        for i, y in enumerate((-1.0005, 1.0005))
+    }
+    null = {"type": "null"}
+    box = {"type": "cube", "bsdf": null, "interior": scenes.medium(1.0, 0.5), "id": "box"}
+    scene = scenes.load({"type": "volpath"}, box, **walls)
+    (shape,) = (s for s in scene.shapes() if s.id() == "box")
+    assert 0.02 < orientation(scene, shape)[0] < 0.5
+    np.testing.assert_allclose(boundary_of(scene, shape).to_world, np.eye(4), atol=1e-6)
+
+
+def test_some_inward_normals_are_refused(scenes, tmp_path):
+    """A box of which two triangles are wound the other way is not a boundary."""
+    shape = scenes.boundary(scenes.medium(1.0, 0.5))
+    cube = scenes.load({"type": "volpath"}, shape)
+    values = mi.traverse(cube.shapes()[0])
+    points = np.array(values["vertex_positions"]).reshape(-1, 3)
+    faces = np.array(values["faces"]).reshape(-1, 3)
+    faces[:2] = faces[:2, ::-1]
+    lines = [f"v {x} {y} {z}" for x, y, z in points]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    (tmp_path / "box.obj").write_text("\n".join(lines) + "\n")
+    again = shape | {"type": "obj", "filename": str(tmp_path / "box.obj"), "face_normals": True}
+    del again["to_world"]
+    scene = scenes.load({"type": "volpath"}, again)
+    with pytest.raises(UnsupportedSceneError, match=r"% of the normals"):
         boundary_of(scene, scene.shapes()[0])
