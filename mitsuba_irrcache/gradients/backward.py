@@ -15,15 +15,18 @@ from mitsuba_irrcache.gradients.medium import MediumAdjoint, field_of, original_
 from mitsuba_irrcache.gradients.parameters import (
     EMISSION,
     MEAN_COSINE,
+    Placement,
     by_parameter,
     channels_of,
+    refuse,
     refuse_all,
     roles_of,
     shaped_like,
 )
 from mitsuba_irrcache.gradients.tangent import ImageTangent, changed_field
 from mitsuba_irrcache.gradients.traced import check as check_traced
-from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, position_of
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of, position_of
 from mitsuba_irrcache.lights.falloff import edges_away
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
@@ -111,7 +114,10 @@ class ParameterAdjoint:
         (medium,) = media_of(scene)
         roles = roles_of(params, keys, medium, scene, emission)
         self._keys, self._roles = keys, roles
-        self._of_medium = {k: role for k, role in roles.items() if not isinstance(role, mi.Emitter)}
+        self._of_medium = {k: role for k, role in roles.items() if isinstance(role, str)}
+        self._placed = {k: role for k, role in roles.items() if isinstance(role, Placement)}
+        if part.cache is not None:
+            check_placements(self._placed, part.cache.grid)
         _check_emission(part, self._of_medium)
         emitters = [role for role in roles.values() if isinstance(role, mi.Emitter)]
         self._emitters = EmitterAdjoint(scene, emitters)
@@ -134,6 +140,8 @@ class ParameterAdjoint:
 
     def along(self, changes: Mapping[str, object]) -> ImageTangent:
         """Return the derivatives of images along ``changes`` of the parameters, by key."""
+        if self._placed:
+            refuse(next(iter(self._placed)), "dr.forward was called")
         medium, fields, g, by_emitter = self._new_medium(channels_apart=True), {}, 0.0, {}
         for key in self._keys:
             change, value = changes[key], self._params[key]
@@ -148,7 +156,9 @@ class ParameterAdjoint:
 
     @cached_property
     def _adjoint(self) -> MediumAdjoint:
-        return self._new_medium()
+        medium = self._new_medium(channels_apart=bool(self._placed))
+        medium.placements = list(self._placed.values())
+        return medium
 
     def _new_medium(self, channels_apart: bool = False) -> MediumAdjoint:
         wanted: dict[str, int] = {}
@@ -163,8 +173,16 @@ class ParameterAdjoint:
         of = self._emitters, self._seed, channels_apart
         return MediumAdjoint(self._scene, self._part, march, wanted, *of)
 
+    def _placement(self, key: str, values: np.ndarray) -> object:
+        """Return derivatives with respect to a position, or to the matrix of a transform."""
+        value = self._params[key]
+        if values.ndim == 1:
+            return type(value)(*(float(v) for v in values))
+        return type(value.matrix)(values.astype(np.float32))
+
     def _by_parameters(self, found: dict[str, mi.Float]) -> dict[str, object]:
-        result = {}
+        placed = {key: found[role] for key, role in self._placed.items() if role in found}
+        result = {key: self._placement(key, values) for key, values in placed.items()}
         for key, role in self._of_medium.items():
             value = self._params[key]
             if role == MEAN_COSINE:
@@ -173,6 +191,15 @@ class ParameterAdjoint:
             field = field_of(original_of(self._part.medium), role)
             result[key] = shaped_like(value, by_parameter(value, field, found[role]))
         return result
+
+
+def check_placements(placed: dict[str, Placement], grid: Grid) -> None:
+    """Refuse derivatives with respect to the position of a light in the medium."""
+    for key, role in placed.items():
+        if kind_of(role.emitter) is EmitterKind.SUN:
+            continue
+        if edges_away(position_of(role.emitter)[:, None], grid) < 1:
+            refuse(key, "the light is in the medium")
 
 
 def _check_emission(part: CachedMedium, of_medium: dict[str, str]) -> None:

@@ -17,8 +17,10 @@ from mitsuba_irrcache.gradients.parameters import (
     EMISSION,
     MEAN_COSINE,
     SIGMA_T,
+    Placement,
 )
 from mitsuba_irrcache.gradients.phase_function import NeighbouringPhases
+from mitsuba_irrcache.gradients.placement import placement_derivative
 from mitsuba_irrcache.gradients.points import add_paths_to_light
 from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, RaySegments
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
@@ -87,6 +89,8 @@ class MediumAdjoint:
         self._scene, self._part, self._wanted = scene, part, wanted
         self._camera_rays, step = image
         self.medium, self._emitters = part.medium, emitters
+        #: emitters with respect to whose position or direction there are derivatives
+        self.placements: list[Placement] = []
         self.transport: AdjointTransport | None = None
         #: number of channels of the sums for each role, see `_sums_for`
         self._sums = self._sums_for(wanted)
@@ -319,8 +323,12 @@ class MediumAdjoint:
         camera = [split(values, count) for values in fluence[: transport.channels]]
         found = transport.derivatives(self.fluence.collided, camera, self.extinction)
         self._emitters.add_transport(transport, found)
+        placed = {
+            role: placement_derivative(role.emitter, self.medium, transport, found)
+            for role in self.placements
+        }
         if not self._wanted:
-            return {}
+            return placed
         volume = 3 * MARGIN * abs(np.linalg.det(self.medium.frame[:3, :3]))
         collided = _largest(found.collided)
         splats = {
@@ -337,7 +345,7 @@ class MediumAdjoint:
         if SIGMA_T in self._sums:
             for light in range(len(transport.point_lights)):
                 result[SIGMA_T] = result[SIGMA_T] + self._along_paths_to_light(light, found)
-        return self._at_data(result)
+        return self._at_data(result) | placed
 
     def _along_paths_to_light(self, light: int, found: Derivatives) -> mi.Float:
         """Return derivatives through the extinction between a point-like light and the voxels."""

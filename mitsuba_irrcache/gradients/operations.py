@@ -145,7 +145,8 @@ class SceneState:
     def _accumulate(self, found: dict[str, object]) -> None:
         # Gradients must not be suspended, or nothing is added.
         for key, grad in found.items():
-            dr.accum_grad(self.params[key], grad)
+            value = self.params[key]
+            dr.accum_grad(value if dr.is_array_v(value) else value.matrix, grad)
 
 
 class Irradiance(dr.CustomOp):

@@ -15,8 +15,17 @@ from mitsuba_irrcache.media.bake import children
 
 #: Roles of a parameter in a medium.
 SIGMA_T, ALBEDO, EMISSION, MEAN_COSINE = "sigma_t", "albedo", "emission", "g"
+#: Parameters that are the position or the direction of emitters, by class.
+PLACED = {"PointLight": "position", "DirectionalEmitter": "to_world"}
 #: Textures of emitters on which their radiance depends linearly.
 RADIANCE = ("radiance", "irradiance", "intensity")
+
+
+class Placement:
+    """The role of a parameter that is the position or the direction of an ``emitter``."""
+
+    def __init__(self, emitter: mi.Emitter) -> None:
+        self.emitter = emitter
 
 
 def enabled(params: Mapping) -> list[str]:
@@ -48,8 +57,8 @@ def roles_of(
     """Return the role of each of the parameters ``keys``, by key.
 
     A role is `SIGMA_T` or `ALBEDO` of ``medium``, the `MEAN_COSINE` of its phase function ``hg``,
-    its `EMISSION` if the parameter belongs to the integrator's volume ``emission``, or the emitter
-    whose radiance the parameter is.
+    its `EMISSION` if the parameter belongs to the integrator's volume ``emission``, the emitter
+    whose radiance the parameter is, or a `Placement` (isotropic media only).
 
     Raises IrrcacheError for any other parameter.
     """
@@ -57,8 +66,11 @@ def roles_of(
     roles = {}
     for key in keys:
         node = params.properties[key][2]
+        placed = PLACED.get(node.class_name()) == key.rpartition(".")[2]
         if node == medium.phase_function() and node.class_name() == "HGPhaseFunction":
             roles[key] = MEAN_COSINE
+        elif placed and medium.phase_function().class_name() == "IsotropicPhaseFunction":
+            roles[key] = Placement(node)
         else:
             roles[key] = role_of(params, key, nodes)
     return roles
@@ -114,7 +126,8 @@ def refuse(key: str, reason: str) -> None:
     """Raise IrrcacheError for a parameter with respect to which no gradient is computed."""
     raise IrrcacheError(
         f'irrcache computes no gradient of the parameter "{key}": {reason}. It has gradients of '
-        "sigma_t and albedo of a medium and of the radiance of emitters and emission; detach this "
+        "sigma_t and albedo of a medium, of the radiance of emitters and emission and, in isotropic "
+        "media without surfaces, of positions of points and directions of suns; detach this "
         'parameter (dr.disable_grad, params.update), or use the integrator "prbvolpath".'
     )
 

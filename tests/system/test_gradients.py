@@ -9,7 +9,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.validation.gradients.cases import CASES, LAMP, POINT, SKY, SUN, Case, sky_with_sun
+from experiments.validation.gradients.cases import (
+    CASES,
+    LAMP,
+    POINT,
+    SKY,
+    SUN,
+    Case,
+    sky_with_sun,
+    spot,
+)
 from experiments.validation.gradients.differences import compare, gradients, key_of, pixel_weights
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients import backward
@@ -100,6 +109,41 @@ def test_images_are_linear_in_the_radiance_of_emitters(rgb, name, max_depth):
     step = 0.2 * value
     expected = (objective(value + step) - objective(value - step)) / 2
     assert (gradient * step).sum() == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("max_depth", [2, -1])
+@pytest.mark.parametrize("kind", ["sun", "point"])
+def test_positions_and_directions_of_lights_have_gradients(rgb, kind, max_depth):
+    """A sun that turns, and a point that moves, by an upstream variable each."""
+    emitters = {"sun": lambda: {"sun": SUN}, "point": lambda: {"point": POINT}}[kind]
+    scene = Case(emitters=emitters, max_depth=max_depth).load()
+    weights, params = pixel_weights(scene), mi.traverse(scene)
+    start = np.array([1.0, 0.3, 0.2]) if kind == "sun" else np.array(POINT["position"])
+
+    def place(amount: mi.Float) -> None:
+        if kind == "sun":
+            turned = mi.Transform4f().rotate([0.48, 0.64, 0.6], 40 * amount)
+            look = mi.Transform4f().look_at([0, 0, 0], [0.4, -1.0, 0.55], [0, 0, 1])
+            params["sun.to_world"] = turned @ look
+        else:
+            way = mi.Point3f(1.0, -0.5, 0.7) * amount
+            params["point.position"] = mi.Point3f(*(float(x) for x in start)) + way
+        params.update()
+
+    amount = mi.Float(0)
+    dr.enable_grad(amount)
+    place(amount)
+    image = mi.render(scene, params, spp=64, seed=3)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32))))
+
+    def objective(value: float) -> float:
+        place(mi.Float(value))
+        return float((np.array(mi.render(scene, spp=64, seed=7), dtype=np.float64) * weights).sum())
+
+    # Tracks of a sun that turns start elsewhere, so that small differences are noise.
+    step = 0.2 if kind == "sun" else 0.05
+    expected = (objective(step) - objective(-step)) / (2 * step)
+    assert dr.grad(amount)[0] == pytest.approx(expected, rel=0.03)
 
 
 # Interface
@@ -377,14 +421,23 @@ def refused(scene: mi.Scene, suffix: str) -> str:
     [
         ("vertex_positions", "it belongs to a Cube"),
         ("sensor.x_fov", "it belongs to a PerspectiveCamera"),
-        ("sun.to_world", '"to_world" is not the radiance of the DirectionalEmitter'),
-        ("point.position", '"position" is not the radiance of the PointLight'),
+        ("spot.to_world", '"to_world" is not the radiance of the SpotLight'),
     ],
 )
 def test_other_parameters_are_refused_by_name(rgb, suffix, reason):
-    emitters = {"sun": SUN, "point": POINT}
-    scene = Case(data=8, cache=8, emitters=lambda: emitters).load()
+    scene = Case(data=8, cache=8, emitters=lambda: {"spot": spot()}).load()
     assert reason in refused(scene, suffix)
+
+
+@pytest.mark.parametrize(("g", "name"), [(0.3, "sun.to_world"), (0.3, "point.position")])
+def test_placements_are_refused_in_anisotropic_media(rgb, g, name):
+    scene = Case(data=8, cache=8, g=g, emitters=lambda: {"sun": SUN, "point": POINT}).load()
+    assert "is not the radiance of" in refused(scene, name)
+
+
+def test_positions_of_lights_in_the_medium_are_refused(rgb):
+    scene = Case(data=8, cache=8, emitters=lambda: {"lamp": LAMP}).load()
+    assert "the light is in the medium" in refused(scene, "lamp.position")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.validation.gradients.cases import CASES, Case, distant, ground
+from experiments.validation.gradients.cases import SURROUNDED, Case, distant, ground
 from experiments.validation.gradients.differences import compare, gradients, key_of, pixel_weights
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients import surroundings
@@ -34,7 +34,7 @@ def fewer_paths(monkeypatch):
     ],
 )
 def test_gradients_are_those_of_the_image(mono, name, parameters):
-    case = CASES[name]
+    case = SURROUNDED[name]
     scene = case.load()
     weights = pixel_weights(scene)
     found = gradients(scene, parameters, weights)
@@ -46,7 +46,7 @@ def test_gradients_are_those_of_the_image(mono, name, parameters):
 
 def test_gradients_in_colour_are_those_of_the_image(rgb):
     """By the reflectance of the ground, and by the irradiance of the sun."""
-    case = CASES["ground, sky and sun, in colour"]
+    case = SURROUNDED["ground, sky and sun, in colour"]
     scene = case.load()
     weights = pixel_weights(scene)
     names = ("floor", "sun")

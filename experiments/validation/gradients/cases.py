@@ -382,5 +382,6 @@ CASES = {
     ),
     "alpha": Case(pixels="rgba", emitters=_under(sun=SUN)),
     **anisotropic(),
-    **surrounded(),
 }
+#: cases whose gradients are computed by paths
+SURROUNDED = surrounded()
