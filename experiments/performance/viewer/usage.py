@@ -21,6 +21,7 @@ from experiments.performance.viewer.browser import Browser, Window, viewer
 from experiments.performance.viewer.load import viewer_memory
 from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
 from mitsuba_irrcache.view.picture import KINDS
+from mitsuba_irrcache.view.slice_panel import ALL, AXES, NONE, THIS
 
 #: Maximum number of windows.
 MOST_WINDOWS = 3
@@ -60,7 +61,7 @@ class User:
         self._actions = {
             self.drag: 8, self.zoom: 4, self.opacity: 4, self.density: 2, self.sun: 2,
             self.undo: 2, self.turn_sun: 2, self.kind: 2, self.compare: 1, self.preset: 1,
-            self.save: 1, self.reload: 1, self.open: 1, self.close: 1,
+            self.save: 1, self.reload: 1, self.open: 1, self.close: 1, self.slices: 1,
         }  # fmt: skip
 
     def act(self) -> None:
@@ -117,6 +118,13 @@ class User:
     def kind(self, window: Window) -> None:
         """Display another quantity."""
         window.choose("show", str(self._rng.choice(KINDS)))
+
+    def slices(self, window: Window) -> None:
+        """Display other slices."""
+        unfolded(window, "Crop and slices", "in the image").choose(
+            "in the image", self._rng.choice([NONE, THIS, ALL])
+        )
+        window.choose("slice across", self._rng.choice(AXES))
 
     def compare(self, window: Window) -> None:
         """Switch the comparison with volpath."""

@@ -50,6 +50,7 @@
       this.split = 0.5;
       this.view = { x: data.width / 2, y: data.height / 2, zoom: 0 }; // zoom 0: fit
       this.tiles = new Map(); // display pixels of an image, by its number
+      this.errorTiles = new Map(); // its errors, if these are displayed
       this.find = (name) => root.querySelector(`[data-id="${name}"]`);
       this.canvas = this.find("canvas");
       this.addChoices();
@@ -99,6 +100,7 @@
 
     changed() {
       this.tiles.clear();
+      this.errorTiles.clear();
       this.readOut();
       this.draw();
     }
@@ -137,6 +139,7 @@
 
     paintError(number, target, quantity) {
       const errors = this.errors(number, quantity), limit = this.limit();
+      this.errorTiles.set(number, errors);
       const signed = quantity === "signed error";
       const colours = this.data.colours[signed ? "signed" : "size"], last = colours.length - 1;
       for (let i = 0; i < this.pixels; i++) {
@@ -223,16 +226,18 @@
       context.restore();
     }
 
-    /** Write the channels of the pixels into them, as far as they are in the pane. */
+    /** Write radiance, or else the displayed error in percent, into the pixels in the pane. */
     drawNumbers(context, number, x, y, scale, from, to) {
-      const { width, height, channels } = this.data, size = clamp(scale / 5, 9, 14);
+      const { width, height } = this.data, size = clamp(scale / 5, 9, 14);
+      const errors = this.errorTiles.get(number), channels = errors ? 1 : this.data.channels;
       context.font = `${size}px ui-monospace, monospace`;
       context.textAlign = "center";
       const first = [Math.floor((from - x) / scale), Math.floor(-y / scale)].map((v) => Math.max(v, 0));
       const last = [Math.min((to - x) / scale, width - 1), Math.min((this.height - y) / scale, height - 1)];
       for (let row = first[1]; row <= last[1]; row++) {
         for (let column = first[0]; column <= last[0]; column++) {
-          const lines = this.values(number, column, row).map((v) => v.toPrecision(3));
+          const values = errors ? [errors[row * width + column]] : this.values(number, column, row);
+          const lines = values.map((v) => v.toPrecision(3) + (errors ? " %" : ""));
           lines.forEach((text, c) => {
             const down = y + (row + 0.5) * scale + (c + 0.85 - channels / 2) * size * 1.05;
             context.strokeStyle = "#000c";
