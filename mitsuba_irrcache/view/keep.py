@@ -17,6 +17,8 @@ from mitsuba_irrcache.view.window import SAMPLES, View
 
 #: Layers in the EXR besides the image.
 SAVED_AOVS = ("colour", "illumination", "background", "transmittance", "depth", "noise", "bias")
+#: How often an image is rendered if the scene is changed while it is saved.
+ATTEMPTS = 10
 #: Pattern of accepted file names: no folders, no hidden files.
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 
@@ -47,7 +49,7 @@ def keep(
 
     def write(samples: Samples, plain: Samples) -> list[Path]:
         if session.has_edit:
-            raise IrrcacheError("the scene was changed while it was saved; save the view again.")
+            return []
         light = session.light
         image, names = samples.channels(SAVED_AOVS, view.look.filtered)
         about = {
@@ -61,12 +63,16 @@ def keep(
         caches = _write_caches(session, path) if with_cache else {}
         return [exr, png, *caches.values(), *_write_scene(session, view, path, samples, caches)]
 
-    with session.reserved():
-        without = replace(view, look=replace(view.look, slices=None))
-        samples = _samples(session, without, layered=True)
-        is_same = view.look.layered and view.look.slices is None
-        plain = samples if is_same else _samples(session, view, layered=view.look.layered)
-        return session.call(lambda: write(samples, plain))
+    without = replace(view, look=replace(view.look, slices=None))
+    is_same = view.look.layered and view.look.slices is None
+    for _ in range(ATTEMPTS):  # again if the scene is changed meanwhile
+        with session.reserved():
+            samples = _samples(session, without, layered=True)
+            plain = samples if is_same else _samples(session, view, layered=view.look.layered)
+            files = session.call(lambda s=samples, p=plain: write(s, p))
+        if files:
+            return files
+    raise IrrcacheError("the scene was changed again and again while it was saved; save it later.")
 
 
 def scene_name(name: str) -> str:

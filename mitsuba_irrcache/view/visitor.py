@@ -28,8 +28,11 @@ from mitsuba_irrcache.view.window import Picture, View
 
 #: JPEG quality for moving cameras and for images that better ones will replace.
 MOVING_QUALITY, RESTING_QUALITY = 80, 95
-#: How often the first camera is placed again in a page that is still loading.
-ATTEMPTS = 5
+#: How often the first camera is placed again in a page that is still loading. It tells its own one
+#: at each step of its layout.
+ATTEMPTS = 40
+#: Largest side of a window in pixels.
+LARGEST_SIDE = 1 << 15
 #: Seconds between two updates of the text below the image.
 NOTE_SECONDS = 0.25
 
@@ -55,6 +58,7 @@ class Visitor:
         self._gone = False
         self._noted = 0.0
         self._view: View | None = None
+        self._size: tuple[int, int] | None = None  # of the image in the browser, pixels
         # Where the camera was placed, where it looks, how much further away it is for a window that
         # is high, and how often it may still be placed again.
         self._placed, self._aimed, self._away = np.zeros(3), np.zeros(3), 1.0
@@ -107,6 +111,7 @@ class Visitor:
         self.editing.bind(self._sensor, lambda name: self._go_to(name))
         self.editing.bind(self._fov, self._set_fov)
         self._reset.on_click(lambda _: self._go_to(self._sensor.value))
+        self._channel.receive("size", self._set_size, self._key)
         self._channel.receive("background", self._set_background, self._key)
         self._export = ExportPanel(self.client, self.session, self.folder, self.editing, self._seen)
 
@@ -122,6 +127,14 @@ class Visitor:
             self._channel.send("comparison", {"mode": "off"}, self._key)
         colour = self._look.background
         self._look = Look(kind, float(exposure), tone, bool(self._filter.value), colour)
+        self.look_again()
+
+    def _set_size(self, value: object) -> None:
+        """Request images of a size in pixels that the browser sent."""
+        width, height = (int(n) for n in value)
+        if not 0 < width <= LARGEST_SIDE or not 0 < height <= LARGEST_SIDE:
+            raise ValueError("the window has no such size")
+        self._size = width, height
         self.look_again()
 
     def _set_background(self, value: object) -> None:
@@ -188,7 +201,7 @@ class Visitor:
     def look_again(self) -> None:
         """Request an image of the present view."""
         camera = self.client.camera
-        if camera.image_width < 1 or camera.image_height < 1:
+        if self._size is None:
             return
         scene = self.session.placement.to_scene
         seen = Camera(
@@ -200,7 +213,7 @@ class Visitor:
         numbers = (*seen.position, *seen.target, *seen.up)
         if not np.isfinite(numbers).all() or seen.distance == 0 or not any(seen.up):
             return  # the browser sent values that are no camera
-        size = camera.image_width, camera.image_height
+        size = self._size
         if self._away != self._distance_factor and np.allclose(camera.position, self._placed):
             self._go_to(self._sensor.value)  # the window was resized before the camera was moved
             return
@@ -230,13 +243,12 @@ class Visitor:
             picture, self._waiting = self._waiting, None
         if self._gone:
             return
-        quality = MOVING_QUALITY if picture.moving else RESTING_QUALITY
-        kind = "png" if picture.final else "jpeg"
-        self.client.scene.set_background_image(picture.pixels, kind, jpeg_quality=quality)
+        # By viser's own connection it would be a texture, which is slow in browsers without a
+        # graphics processor.
+        self._channel.send("picture", _encoded(picture), self._key)
         if not picture.moving or monotonic() - self._noted > NOTE_SECONDS:
             self._noted = monotonic()
             self._tell(picture)
-        self.client.flush()
 
     def _tell(self, picture: Picture) -> None:
         """Send what lies over the image: a note about it, and the comparison."""
@@ -254,6 +266,19 @@ class Visitor:
             found = Compared(picture.view.compared, "volpath waits until the camera stops")
         send("comparison", described(found), key)
         if found.reference is not None:
-            pixels = io.BytesIO()
-            Image.fromarray(found.reference).save(pixels, "JPEG", quality=RESTING_QUALITY)
-            send("reference", pixels.getvalue(), key)
+            send("reference", _jpeg(found.reference, RESTING_QUALITY), key)
+
+
+def _encoded(picture: Picture) -> bytes:
+    """Return the file of an image: a PNG if it is final, otherwise a JPEG."""
+    if not picture.final:
+        return _jpeg(picture.pixels, MOVING_QUALITY if picture.moving else RESTING_QUALITY)
+    file = io.BytesIO()
+    Image.fromarray(picture.pixels).save(file, "PNG", compress_level=1)
+    return file.getvalue()
+
+
+def _jpeg(pixels: np.ndarray, quality: int) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=quality)
+    return file.getvalue()

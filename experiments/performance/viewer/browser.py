@@ -20,29 +20,18 @@ CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 PATIENCE = 240.0
 #: Milliseconds for which a folder of the panel moves when it is opened: a click would miss.
 FOLDING = 400
-#: Records the time of every mouse event, and of every displayed image that was made of received
-#: data instead of the page's own. Only final images are sent as PNG.
+#: Records the time of every mouse event, and of every displayed image.
 _HOOKS = """
 (() => {
   const now = () => performance.timeOrigin + performance.now();
   window.__moves = []; window.__shown = [];
-  const kinds = {}, create = URL.createObjectURL;
-  URL.createObjectURL = blob => { const url = create(blob); kinds[url] = blob.type; return url; };
   for (const kind of ['pointermove', 'wheel'])
     window.addEventListener(kind, () => window.__moves.push(now()), true);
-  for (const name of ['texImage2D', 'texSubImage2D']) {
-    const original = WebGL2RenderingContext.prototype[name];
-    WebGL2RenderingContext.prototype[name] = function (...args) {
-      const image = args[args.length - 1];
-      if (image instanceof HTMLImageElement && image.src.startsWith('blob:')) {
-        const final = kinds[image.src] == 'image/png';
-        const entry = {width: image.width, height: image.height, src: image.src, at: 0, final};
-        window.__shown.push(entry);
-        requestAnimationFrame(() => { entry.at = now(); });
-      }
-      return original.apply(this, args);
-    };
-  }
+  window.addEventListener('irrcache-picture', ({detail}) => {
+    const entry = {...detail, at: 0};
+    window.__shown.push(entry);
+    requestAnimationFrame(() => { entry.at = now(); });
+  });
 })();
 """
 

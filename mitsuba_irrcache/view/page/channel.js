@@ -1,18 +1,24 @@
 // The connection of the components on this page to the viewer; see view/channel.py.
 "use strict";
 
-// Viser lowers its resolution where frames are slow, and images at rest stayed coarse.
+// Viser's canvas shows arrows and edges only, over the image. Browsers without a graphics processor
+// would take most of a frame to clear it, and viser lowers its resolution where frames are slow.
 {
   const address = new URL(window.location.href);
   if (!address.searchParams.has("fixedDpr")) {
-    address.searchParams.set("fixedDpr", String(Math.min(window.devicePixelRatio || 1, 2)));
+    const context = document.createElement("canvas").getContext("webgl2");
+    const named = context && context.getExtension("WEBGL_debug_renderer_info");
+    const name = named ? context.getParameter(named.UNMASKED_RENDERER_WEBGL) : "";
+    if (context) context.getExtension("WEBGL_lose_context")?.loseContext();
+    const slow = /swiftshader|llvmpipe|software|basic render/i.test(name);
+    address.searchParams.set("fixedDpr", slow ? "0.5" : String(Math.min(window.devicePixelRatio, 2)));
     window.history.replaceState(null, "", address);
   }
 }
 
 const irrcache = (() => {
   const receivers = new Map(), newest = new Map();
-  let socket = null, key = null, closed = false;
+  let socket = null, key = null, closed = false, told = 0;
 
   function connect() {
     const address = new URL("irrcache", window.location.href);
@@ -21,7 +27,7 @@ const irrcache = (() => {
     socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
-      if (key) send("window", key);
+      if (key) introduce();
       if (closed) deliver("connection", "");
       closed = false;
     };
@@ -47,8 +53,16 @@ const irrcache = (() => {
     for (const receive of receivers.get(kind) || []) receive(value);
   }
 
+  /** Send a message; return whether that was possible. */
   function send(kind, value) {
-    if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ kind, value }));
+    if (!socket || socket.readyState !== WebSocket.OPEN) return false;
+    socket.send(JSON.stringify({ kind, value }));
+    return true;
+  }
+
+  /** Tell the viewer which of its windows this page is. */
+  function introduce() {
+    if (send("window", key)) told += 1;
   }
 
   /** Call a function with the values of a kind of message, the newest one included. */
@@ -76,14 +90,14 @@ const irrcache = (() => {
     };
   }
 
-  // Tells the viewer which of its windows this page is.
   customElements.define("irrcache-window", class extends HTMLElement {
     connectedCallback() {
       key = this.getAttribute("key");
-      send("window", key);
+      introduce();
     }
   });
 
   connect();
-  return { send, receive, throttled };
+  // How often the page has introduced itself: after each time, the viewer needs its size.
+  return { send, receive, throttled, connections: () => told };
 })();

@@ -2,12 +2,15 @@
 //
 // Messages of the viewer: "wait" (text before the first image), "note" (of the image), "status" (of
 // the caches), "camera" (rows right, up, forward), "axes" (labels), "comparison" (mode and
-// captions), "reference" (a JPEG); see view/visitor.py and view/panel.py.
+// captions), "reference" (a JPEG), "picture" (the image, which lies behind viser's canvas); see
+// view/visitor.py and view/panel.py.
 "use strict";
 
 (() => {
   const CORNER = 34;
   const PANEL = 324; // width of viser's panel, before it is there
+  const picture = Object.assign(document.createElement("canvas"), { id: "irrcache-picture" });
+  let size = [], connection = 0, pictures = 0, displayed = 0;
   let root, split = 0.5, comparison = { mode: "off" }, shown = null;
   const find = (name) => root.querySelector(`[data-id="${name}"]`);
   const set = (name, text) => {
@@ -43,13 +46,39 @@
     });
   }
 
-  /** Keep the overlay over viser's canvas, which the panel beside it makes smaller. */
+  /** Keep the overlay over viser's canvas, which the panel beside it makes smaller, the image behind
+   * it, and the viewer informed of its size in pixels of the screen. */
   function follow() {
     const canvas = document.querySelector("#root canvas[data-engine]") || document.querySelector("#root canvas");
+    if (canvas && picture.parentElement !== canvas.parentElement) canvas.parentElement.prepend(picture);
+    if (canvas) tellSize(canvas);
     const box = canvas ? canvas.getBoundingClientRect()
       : { left: 0, top: 0, width: window.innerWidth - PANEL, height: window.innerHeight };
     for (const side of ["left", "top", "width", "height"]) root.style[side] = `${box[side]}px`;
     window.setTimeout(follow, canvas ? 250 : 50);
+  }
+
+  function tellSize(canvas) {
+    const ratio = Math.min(window.devicePixelRatio, 2);
+    const now = [canvas.clientWidth, canvas.clientHeight].map((n) => Math.round(n * ratio));
+    if (now.join() === size.join() && connection === irrcache.connections()) return;
+    if (!irrcache.send("size", now)) return;
+    size = now;
+    connection = irrcache.connections();
+  }
+
+  /** Show an image that the viewer has rendered; JPEG, or PNG if none will follow. */
+  async function show(bytes) {
+    const number = ++pictures, isFinal = bytes[0] === 0x89;
+    const type = isFinal ? "image/png" : "image/jpeg";
+    const image = await createImageBitmap(new Blob([bytes], { type })).catch(() => null);
+    if (!image || number < displayed) return; // a newer one was decoded earlier
+    displayed = number;
+    [picture.width, picture.height] = [image.width, image.height];
+    picture.getContext("bitmaprenderer").transferFromImageBitmap(image);
+    find("preview").hidden = true;
+    const detail = { width: picture.width, height: picture.height, final: isFinal };
+    window.dispatchEvent(new CustomEvent("irrcache-picture", { detail }));
   }
 
   function grab(event) {
@@ -157,6 +186,7 @@
       if (text.endsWith("per pixel")) find("preview").hidden = true; // an image, no message
     });
     irrcache.receive("preview", preview);
+    irrcache.receive("picture", show);
     irrcache.receive("hint", (text) => set("hint", text));
     irrcache.receive("comparison", compare);
     irrcache.receive("reference", showReference);

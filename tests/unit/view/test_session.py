@@ -16,6 +16,7 @@ import pytest
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.images import read_image
+from mitsuba_irrcache.view import keep as keeping
 from mitsuba_irrcache.view import picture
 from mitsuba_irrcache.view import session as sessions
 from mitsuba_irrcache.view import window as windows
@@ -87,6 +88,31 @@ def test_a_window_at_rest_gets_the_image_that_render_gives(session, tmp_path, ba
     parts = (layers[f"{kind}.G"] for kind in ("colour", "illumination", "background"))
     colour, illumination, background = parts
     np.testing.assert_allclose(colour * illumination + background, layers["G"], atol=2e-5)
+
+
+def test_a_view_that_is_saved_during_an_edit_shows_the_edit(session, tmp_path, monkeypatch):
+    """Image and scene are of one state, the edited one, though the edit came in between."""
+    screen = Screen()
+    window = session.open(screen.show)
+    view = View(front(session), SIZE)
+    session.look(window, view)
+    before = screen.wait(final).pixels
+    sampled, edits = keeping._samples, [4.0]
+
+    def and_edited(*arguments, **options) -> Samples:
+        found = sampled(*arguments, **options)
+        if edits:
+            session.edit(lambda document: document.set_density(edits.pop()))
+        return found
+
+    monkeypatch.setattr(keeping, "_samples", and_edited)
+    keep(session, view, tmp_path, "kept", with_cache=True)
+    assert session.document.density == 4 and not session.has_edit
+    shown = np.rint(255 * read_image(tmp_path / "kept.png"))
+    assert main(["render", str(tmp_path / "kept-scene.xml")]) == 0
+    again = np.rint(255 * read_image(tmp_path / "kept-scene.png"))
+    # The first caches after an edit are noisy.
+    assert np.abs(again - shown).mean() < 0.2 * np.abs(shown - before).mean()
 
 
 @pytest.fixture
