@@ -46,6 +46,8 @@ COARSEST, LARGEST_RATIO, SMALLEST_RATIO = 8, 2.0, 1.3
 #: Order of the error in the voxel edge: assumed for the first two levels, and if it is not known,
 #: and its limits. Fewer voxels than FEWEST are too few to estimate it.
 FIRST_ORDER, ASSUMED_ORDER, ORDERS, FEWEST = 1.0, 1.3, (0.8, 1.7), 16
+#: The least error due to detail that voxels do not resolve, in units of its estimate.
+LEAST_OF_DETAIL = 1 / 3
 #: The next resolution is larger by this factor than predicted.
 MARGIN = 1.1
 #: Finest resolution that is tried, unless the data have more voxels along their longest side.
@@ -110,10 +112,10 @@ class Level:
         self.builder.samples, self.scatter, self.noise_free = samples, None, None
 
     def error_of_detail(self) -> float:
-        """Return the estimated error due to detail of the data that the voxels do not resolve."""
+        """Return the least error due to detail of the data that the voxels do not resolve."""
         parts = [part for part in self.builder.parts if part.cache is not None]
         errors = (unresolved_error(part.medium, part.cache.grid) for part in parts)
-        return max(errors, default=0.0) / 100
+        return LEAST_OF_DETAIL * max(errors, default=0.0) / 100
 
 
 class ToleranceSearch:

@@ -63,9 +63,9 @@ MOST_REFINED = 1 << 24
 SMOOTH_ERROR, DEPTH_ERROR, DETAIL_ERROR, MOST_DETAIL_DEPTH = 0.4, 0.3, 7.0, 0.25
 #: RMSE [% of the mean] of an image due to detail of the data that voxels do not resolve:
 #: UNRESOLVED_ERROR a min(d, OPAQUE), with a and d as above, about, for the scenes of
-#: experiments/validation/defaults. Voxels are refined above LARGE_UNRESOLVED, to at most
-#: MOST_FOR_DETAIL voxels.
-UNRESOLVED_ERROR, LARGE_UNRESOLVED, MOST_FOR_DETAIL = 6.0, 1.0, 1 << 22
+#: experiments/validation/defaults; compact dense bodies have a third of it and less. Voxels are
+#: refined above LARGE_UNRESOLVED, to at most MOST_FOR_DETAIL voxels.
+UNRESOLVED_ERROR, LARGE_UNRESOLVED, MOST_FOR_DETAIL = 6.0, 1.0, 1 << 21
 #: Error [%] above which the warning is logged.
 NOTABLE_UNRESOLVED = 0.8
 #: Ratio of the minimum resolution of media that hold emitting shapes to that of others. The voxels
