@@ -68,6 +68,13 @@ CASES: dict[str, Callable[[], tuple[dict, dict, int]]] = {
     "square 3.0 above, dense fog, single": lambda: (
         flat("rectangle", 1.5, (0, 1.3, 0), (0, -1, 0)), fog(6.0), 2,
     ),
+    "square 3.0 above, dense fog, all orders": lambda: (
+        flat("rectangle", 1.5, (0, 1.3, 0), (0, -1, 0)), fog(6.0), -1,
+    ),
+    "disk 4.0 beside, denser fog, single": lambda: (
+        flat("disk", 2.0, (-1.4, 0.2, 0.1), (1, 0, 0)), fog(12.0), 2,
+    ),
+    "sphere 6.0 above, denser fog, single": lambda: (sphere(3.0, (0, 4.5, 0)), fog(12.0), 2),
 }  # fmt: skip
 
 
