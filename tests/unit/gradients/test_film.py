@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients.film import FilmAdjoint
+from mitsuba_irrcache.gradients.film import LANES, FilmAdjoint
 from mitsuba_irrcache.render.film import render_film
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -55,21 +55,20 @@ def test_film_adjoint_is_the_transpose_of_the_film(name):
     assert total == pytest.approx((image * grad).sum(), abs=2e-6 * scale)
 
 
-def test_passes_are_all_samples(monkeypatch):
+def test_passes_are_all_samples():
     """Samples in several launches, with a filter that reaches beyond pixels."""
     sensor = camera(**FILMS["gaussian"])
     grad = np.random.default_rng(1).normal(size=(8, 9, 3)).astype(np.float32)
 
-    def total() -> tuple[int, float]:
-        adjoint, found = FilmAdjoint(sensor, mi.TensorXf(grad), 5, 6), []
+    def total(lanes: int) -> tuple[int, float]:
+        adjoint, found = FilmAdjoint(sensor, mi.TensorXf(grad), 5, 6, lanes), []
         for each in adjoint.passes():
             colour, _ = values_along(each.ray)
             found.append(float(np.array(dr.dot(each.radiance, colour), dtype=np.float64).sum()))
         return len(found), sum(found)
 
-    one, expected = total()
-    monkeypatch.setattr("mitsuba_irrcache.gradients.film.LANES", 2 * 72)
-    several, result = total()
+    one, expected = total(LANES)
+    several, result = total(2 * 72)
     assert (one, several) == (1, 3)
     assert result == pytest.approx(expected, rel=1e-4)
 
