@@ -69,8 +69,8 @@ UNRESOLVED_ERROR, LARGE_UNRESOLVED, MOST_FOR_DETAIL = 6.0, 1.0, 1 << 21
 #: Error [%] above which the warning is logged.
 NOTABLE_UNRESOLVED = 0.8
 #: Ratio of the minimum resolution of media that hold emitting shapes to that of others. Next
-#: to a luminous surface images are too dark, by an error that falls with the edge of a voxel: the
-#: mean of a foggy room is off by -0.55 % with 32 voxels and -0.17 % with 48, for 1.2 times the time.
+#: to a luminous surface images are too dark, by an error that falls with the edge of a voxel. The
+#: mean of a foggy room is off by -0.55 % with 32 voxels and -0.17 % with 48 (1.2 times the time).
 FINER_AROUND_EMITTERS = 1.5
 #: Ratio between the resolutions that are tried, the largest of them in units of the resolution
 #: chosen otherwise, and number of positions at which detail is measured.
