@@ -63,7 +63,7 @@ class CacheSettings:
     seed: int = 0
     file: str = ""
     with_error: bool = False  # whether a standard error is needed: at least two batches
-    is_trial: bool = False  # whether a search tries several caches, and reports their errors
+    warns: bool = True  # of expected errors; a search and the viewer report these themselves
 
 
 class CachedMedium:
@@ -196,7 +196,7 @@ class CachedMedium:
         grid, size_reason = self._choose_grid()
         basis = _angular_basis(scene, medium)
         self._check_memory(grid, basis.count if basis is not None else 0)
-        if not settings.is_trial:
+        if settings.warns:
             warn_of_dense_border(medium, grid)
             if not warn_of_opaque_voxels(medium, grid, settings.max_depth):
                 warn_of_unresolved_detail(medium, grid)

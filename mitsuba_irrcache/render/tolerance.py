@@ -246,7 +246,7 @@ class ToleranceSearch:
         given = self._settings.samples
         samples = -(-given // 2) if given else samples or self.least_part
         settings = replace(
-            self._settings, resolution=resolution, samples=samples, file="", is_trial=True
+            self._settings, resolution=resolution, samples=samples, file="", warns=False
         )
         return Level(resolution, self._new_builder(settings), self._camera_rays)
 

@@ -98,6 +98,7 @@ class Document:
             solver=str(read("solver", "auto")),
             resolution=int(read("resolution", 0)),
             seed=int(read("cache_seed", 0)),
+            warns=False,  # at every edit; windows show estimated errors
         )
 
     @property
