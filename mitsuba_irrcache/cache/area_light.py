@@ -233,6 +233,20 @@ class AreaLight(DirectLight):
         shift = shift_at(p) if shift is None else shift
         return self._depth_to_points(mean, p, self._lookup_points, shift)
 
+    def depths_along(
+        self,
+        ray: mi.Ray3f,
+        ends: tuple[mi.Float, mi.Float],
+        means: tuple,
+        places: Sequence[mi.Float | float],
+    ) -> list[mi.Float | mi.Color3f]:
+        """See the base class; a parabola, if depths are averages over points."""
+        if self._lines != EACH:
+            return super().depths_along(ray, ends, means, places)
+        first, middle, last = super().depths_along(ray, ends, means, (0.0, 0.5, 1.0))
+        slope, curvature = 4 * middle - 3 * first - last, 2 * (first + last) - 4 * middle
+        return [dr.maximum(first + u * (slope + u * curvature), 0) for u in places]
+
     def _depth_to_points(
         self, mean: mi.Float | mi.Color3f, p: mi.Point3f, count: mi.UInt32, shift: mi.Vector2f
     ) -> mi.Float | mi.Color3f:

@@ -14,6 +14,7 @@ Camera rays exclude these values and evaluate E(p) exp(-tau(p)) instead.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -134,6 +135,21 @@ class DirectLight:
         """
         # docs/primer, eq. (2.5)
         return mean * self.length(p)
+
+    def depths_along(
+        self,
+        ray: mi.Ray3f,
+        ends: tuple[mi.Float, mi.Float],
+        means: tuple,
+        places: Sequence[mi.Float | float],
+    ) -> list[mi.Float | mi.Color3f]:
+        """Return optical depths between places on segments of rays and the emitter.
+
+        ``ends`` are distances along the rays, ``means`` the mean extinctions there, ``places`` are
+        fractions of the segments.
+        """
+        shift = shift_at(ray(ends[0]))
+        return [self.depth_of(dr.lerp(*means, u), ray(dr.lerp(*ends, u)), shift) for u in places]
 
     def peak_depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """Return the optical depth of scattering into the truncated forward peak between world
@@ -456,11 +472,8 @@ class DirectLightAlongRays:
         near, far = (extinction * (b - a) for extinction in extinctions)
         at = self._parts(ray, a, b, 0.5 * (near + far))
         middles = [0.5 * (u + v) for u, v in pairwise(at)]
-        shift = shift_at(ray(a))
-        depths, inner = (
-            [light.depth_of(dr.lerp(*means, u), ray(dr.lerp(a, b, u)), shift) for u in places]
-            for places in (at, middles)
-        )
+        depths = light.depths_along(ray, (a, b), means, [*at, *middles])
+        depths, inner = depths[: len(at)], depths[len(at) :]
         passed = [dr.fma(near, u * (1 - 0.5 * u), far * (0.5 * u * u)) for u in at]
         total = mi.Spectrum(0)
         for i, u in enumerate(middles):
