@@ -266,9 +266,10 @@ class AreaLight(DirectLight):
         transmitted, _, weight, *_ = self._sums(scene, p, count, stream)
         exact = dr.mean(transmitted) / dr.maximum(weight, 1e-20)
         scale = dr.select(self._medium.contains(p), self._solid_angle.at(p), 0)
-        depth = self.depth(p)
         if self._lines == EACH:  # without the noise of few points
             depth = self._depth_to_points(self.extinction.at_world(p), p, count, shift_at(p))
+        else:
+            depth = self.depth(p)
         error = dr.abs(dr.mean(mi.Spectrum(dr.exp(-depth))) - exact)
         total, reference = dr.sum(scale * error), dr.sum(scale * exact)
         return float(total[0]) / max(float(reference[0]), 1e-30)
@@ -347,10 +348,10 @@ class AreaLight(DirectLight):
         the mean extinction along the line to each.
         """
         if self._lines == EACH:
-            mean = _mean_of_channels(self.extinction.at_world(p))
+            mean = channel_mean(self.extinction.at_world(p))
         else:
             length = self._length_to(p, self._solid_angle.closest(p))
-            mean = mean_over(length, _mean_of_channels(self.depth(p)), 0)
+            mean = mean_over(length, channel_mean(self.depth(p)), 0)
         count, shift = self._phase_samples, shift_at(p)
         return self._mean_residual(basis, p, direction, mean, count, shift, peak_depth)
 
@@ -541,11 +542,6 @@ def _with_harmonics(
 def _any_channel(mask: mi.Bool | mi.Color3f) -> mi.Bool:
     """Return whether a condition holds for any channel of a value that may have one."""
     return mask if isinstance(mask, mi.Bool) else mask[0] | mask[1] | mask[2]
-
-
-def _mean_of_channels(value: mi.Float | mi.Color3f) -> mi.Float:
-    """Return the mean over the channels of a value that may have one."""
-    return value if isinstance(value, mi.Float) else channel_mean(value)
 
 
 def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:

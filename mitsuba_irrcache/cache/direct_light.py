@@ -502,7 +502,7 @@ class DirectLightAlongRays:
         Three parts of equal absorptance, one of which is divided at the kink (see `_kink`). Returns
         the five ends of the parts as fractions of the segment.
         """
-        depth = depth if isinstance(depth, mi.Float) else channel_mean(depth)
+        depth = channel_mean(depth)
         absorbed, thin = absorptance(depth), depth < 1e-3
         thirds = [
             dr.select(thin, k, -dr.log(1 - k * absorbed) / dr.select(thin, 1, depth))

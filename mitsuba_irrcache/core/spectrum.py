@@ -28,11 +28,13 @@ def scatter_channels(flat: mi.Float, channels: list[mi.Float], items: mi.UInt32)
         dr.scatter(flat, value, first + dr.opaque(mi.UInt32, i))
 
 
-def channel_mean(values: mi.Color3f) -> mi.Float:
-    """Return the mean over the channels.
+def channel_mean(values: mi.Float | mi.Color3f) -> mi.Float:
+    """Return the mean over the channels, of which a value may have one.
 
     Unlike those of ``dr.mean``, the kernels do not depend on the number of lanes.
     """
+    if isinstance(values, mi.Float):
+        return values
     return dr.sum(values) * (1 / len(values))
 
 
