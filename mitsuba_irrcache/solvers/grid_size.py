@@ -74,7 +74,7 @@ NOTABLE_UNRESOLVED = 0.8
 FINER_AROUND_EMITTERS = 1.5
 #: Ratio between the resolutions that are tried, the largest of them in units of the resolution
 #: chosen otherwise, and number of positions at which detail is measured.
-SIZE_RATIO, LARGEST_SHARE, POSITIONS = 2**0.25, 0.9, 1 << 20
+SIZE_RATIO, LARGEST_SHARE, POSITIONS = 2**0.25, 0.9, 1 << 18
 
 
 @dataclass(frozen=True)
@@ -254,12 +254,15 @@ def _lost_detail(medium: MediumGrid, sides: np.ndarray) -> float:
         return found
 
     middle = values(centre)
-    total = [float(dr.sum(dr.square(v))[0]) for v in middle]
-    parts = np.zeros(len(middle))
+    squares = [[dr.square(v) for v in middle]]
     for axis, count in enumerate(sides):
-        half = mi.Vector3f(*(float(v) for v in medium.frame[:3, axis] / (2 * count)))
+        # Opaque, so that another number of voxels or another frame reuses the kernel.
+        half = mi.Vector3f(*(dr.opaque(mi.Float, v / (2 * count)) for v in medium.frame[:3, axis]))
         ends = zip(values(centre + half), values(centre - half), middle, strict=True)
-        parts += [float(dr.sum(dr.square(m - 0.5 * (a + b)))[0]) for a, b, m in ends]
+        squares.append([dr.square(m - 0.5 * (a + b)) for a, b, m in ends])
+    dr.eval(squares)  # in one kernel
+    total, *parts = np.array([[float(dr.sum(s)[0]) for s in row] for row in squares])
+    parts = np.sum(parts, axis=0)
     ratios = [part / whole for part, whole in zip(parts, total, strict=True) if whole > 0]
     return float(np.sqrt(max(ratios, default=0.0)))
 

@@ -39,7 +39,7 @@ ERROR_SCALE = 10.0
 EXPOSURES = (-8.0, 8.0)
 #: Pixels traced in one launch. It is the same for all images, since all random numbers depend on
 #: it.
-BAND = 1 << 16
+BAND = 1 << 15
 #: Distance between the random streams of successive passes: one number per sample selects the
 #: luminance channel.
 STREAM = 0x9E3779B9

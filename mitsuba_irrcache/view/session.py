@@ -274,7 +274,7 @@ class Session:
             self._closed.pop().forget()
         while self._tasks:
             self._tasks.popleft()()
-        if self._show_moving():
+        if self._show_coarse():
             return True
         if any(w.is_moving for w in self._windows):
             return False
@@ -348,7 +348,7 @@ class Session:
             return
         with self._noted("interruption"):
             while not self._is_called:
-                if self._show_moving():
+                if self._show_coarse():
                     continue
                 rest = self._until_rest
                 if rest is not None:
@@ -361,9 +361,11 @@ class Session:
 
     # ------------------------------------------------------------------ pictures
 
-    def _show_moving(self) -> bool:
-        """Render a low-cost image for a window whose moving camera has a view not rendered yet."""
-        waiting = [w for w in self._windows if w.fresh and w.is_moving]
+    def _show_coarse(self) -> bool:
+        """Render a low-cost image for a window whose camera moves, or whose image is older than
+        the last edit.
+        """
+        waiting = [w for w in self._windows if w.needs_coarse]
         if not waiting or self._shown is None:
             return False
         window = min(waiting, key=lambda w: w.moved)
@@ -395,8 +397,8 @@ class Session:
         return True
 
     def _give_way(self) -> None:
-        """Abort an image at rest between two bands if a camera has moved."""
-        if self._stopped or any(w.fresh and w.is_moving for w in self._windows):
+        """Abort an image at rest between two bands if a camera has moved, or for an edit."""
+        if self._is_called or any(w.fresh and w.is_moving for w in self._windows):
             raise Superseded
 
     def _refine_picture(self) -> bool:

@@ -57,7 +57,7 @@ class Picture:
         pixels: uint8 (height, width, 3).
         view: the view that it shows.
         samples: per pixel.
-        moving: whether the camera moves.
+        moving: whether it is coarse, because the camera moves or for a first look after an edit.
         final: whether no better image will follow.
         compared: the comparison with ``volpath``, if one was requested.
     """
@@ -78,6 +78,7 @@ class Window:
         self.view: View | None = None
         self.moved = -np.inf  # time of the camera's last movement
         self.fresh = False  # whether the view has not been rendered yet
+        self.outdated = False  # whether the displayed image is older than the last edit
         self.level = len(LEVELS) // 2
         self.samples: Samples | None = None
         self._resting: View | None = None  # the view of `samples`
@@ -111,10 +112,12 @@ class Window:
         """Reset the window to the state without a view, and release its images."""
         self.view, self.fresh, self._resting = None, False, None
         self.samples = self._light = self._comparison = None
+        self.outdated = False
 
     def let_go(self, light: Light) -> None:
         """Release images of caches other than ``light``."""
         if self._light is not light:
+            self.outdated = self.view is not None
             self.samples = self._light = None
         if self._comparison is not None and self._comparison.light is not light:
             self._comparison = None
@@ -127,6 +130,13 @@ class Window:
             return True
         return not first and (self._revision != revision or self.samples.count < SAMPLES)
 
+    @property
+    def needs_coarse(self) -> bool:
+        """Return whether a coarse image has to come first: the camera moves, or the displayed image
+        is older than the last edit.
+        """
+        return self.outdated or (self.fresh and self.is_moving)
+
     def is_complete(self, seen: Seen, view: View) -> bool:
         """Return whether all samples of an image at rest of ``view`` from ``seen`` are there."""
         had = self.samples
@@ -138,7 +148,7 @@ class Window:
         )
 
     def quick(self, light: Light, view: View, extent: tuple[float, float]) -> Picture:
-        """Render an image of a moving camera at the level of detail that is fast enough."""
+        """Render an image at the level of detail that is fast enough for moving cameras."""
         share, stride = LEVELS[self.level]
         size = tuple(max(round(n * share), 1) for n in view.size)
         started, look = perf_counter(), replace(view.look, filtered=False)  # no time for that
@@ -151,6 +161,7 @@ class Window:
         finally:
             seen.stride(1.0)
         self.level = _adapted(self.level, perf_counter() - started)
+        self.outdated = False
         return Picture(pixels, view, 1, True, False)
 
     def refined(
@@ -181,7 +192,7 @@ class Window:
                 samples.add(SAMPLES, pause)
             samples.add(SAMPLES, pause)
         self.samples, self._resting = samples, view
-        self._revision, self._light = revision, light
+        self._revision, self._light, self.outdated = revision, light, False
         return self._picture(view, extent, improving)
 
     def is_comparing(self, light: Light, revision: int) -> bool:

@@ -202,6 +202,38 @@ def test_no_kernel_is_compiled_for_another_camera_or_size(session, kernels):
     assert used and all(k["cache_hit"] for k in used)
 
 
+def test_no_kernel_is_compiled_for_another_edit(session, kernels):
+    """Other volumes of the same size and kind are displayed by the kernels that exist."""
+
+    shapes = set()
+
+    def display(top: float) -> None:
+        values = np.random.default_rng(1).random((5, 6, 7), np.float32) * np.float32(top)
+        session._edit(lambda document: document.set_volumes({"density.vol": values}))
+        session._light.refine()
+        shapes.add(session._light.parts[0].cache.grid.shape)
+        dr.sync_thread()
+
+    session.call(lambda: display(1.0))
+    used = session.call(lambda: kernels(lambda: [display(6.0), display(9.0)]))
+    assert len(shapes) == 3
+    assert used and all(k["cache_hit"] for k in used)
+
+
+def test_an_edit_is_displayed_coarsely_first(session):
+    """The first image after an edit is a coarse one, for a short delay; then the image at rest."""
+    screen = Screen()
+    window = session.open(screen.show)
+    session.look(window, View(front(session), SIZE))
+    screen.wait(final)
+    count = len(screen.pictures)
+    session.edit(lambda document: document.set_density(0.3))
+    screen.wait(lambda p: len(screen.pictures) > count + 1 and p.final)
+    first, *others = screen.pictures[count:]
+    assert first.moving and first.pixels.size < others[-1].pixels.size
+    assert not any(p.moving for p in others)
+
+
 def test_edits_display_no_black_images(session):
     """After an edit, every image is as bright as the old or the new scene."""
     screen = Screen()
