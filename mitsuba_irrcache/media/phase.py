@@ -11,7 +11,7 @@ coefficients suffice.
 
 from __future__ import annotations
 
-from functools import cache, cached_property
+from functools import cache
 
 import drjit as dr
 import mitsuba as mi
@@ -61,6 +61,9 @@ class Phase:
         self.forward = forward
         #: moments including the forward peak
         self.all_moments = moments if all_moments is None else all_moments
+        #: Correction of narrow sources for multiple scattering into the ``forward`` peak. It is not
+        #: left to its first use, in a symbolic loop: evaluating arrays there can abort Dr.Jit.
+        self.aureole = self._aureole() if forward and plugin is not None else None
 
     def tail(self, order: int) -> float:
         """Return the largest magnitude of the moments beyond ``order``."""
@@ -96,9 +99,7 @@ class Phase:
         moments = np.where(known, (self.moments - share) / (1 - share), 0)
         return Phase(self.plugin, moments, self.peak / (1 - share), share, self.moments)
 
-    @cached_property
-    def aureole(self) -> Aureole:
-        """Correction of narrow sources for multiple scattering into the ``forward`` peak."""
+    def _aureole(self) -> Aureole:
         moments = legendre_moments(self.plugin, PEAK_MOMENTS)[0] / self.forward
         moments[: self.order + 1] = 1
         return Aureole(moments, self.forward / (1 - self.forward))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+
+from mitsuba_irrcache.media import phase
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -150,3 +153,22 @@ def test_shadows(kind, objects):
     assert noise < 0.006
     assert abs(mean) < 0.01 + noise
     assert block < 0.025 + 2 * noise
+
+
+def test_phase_functions_are_not_evaluated_within_loops(monkeypatch):
+    """Tables of the peak exist before rays are marched.
+
+    Evaluating arrays while Dr.Jit records a loop can abort the process.
+    """
+    evaluate, within = phase._evaluate, []
+
+    def observed(*args: object, **options: object) -> tuple:
+        within.append(dr.flag(dr.JitFlag.SymbolicScope))
+        return evaluate(*args, **options)
+
+    monkeypatch.setattr(phase, "_evaluate", observed)
+    settings = {"type": "irrcache", "solver": "sweep", "resolution": 4, "cache_spp": 16}
+    scene = load(settings, TOWARDS_THE_LIGHT, cloud=cloud(2.0, 0.85), sun=emitter("sun", 20))
+    assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
+    assert within
+    assert not any(within)
