@@ -8,6 +8,7 @@ import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.emitters import solid_angles
+from mitsuba_irrcache.gradients.lights import LightsOfOneDirection
 from mitsuba_irrcache.gradients.transport import AdjointTransport
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 
@@ -36,13 +37,16 @@ class EmitterTangents:
         """Return the change of the radiance of the environment that rays see."""
         return mi.Spectrum(0) if self._environment is None else self._environment.along(-ray.d)
 
-    def points(self, transport: AdjointTransport) -> list[mi.Spectrum]:
-        """Return the changes of the irradiance of point-like lights in all voxels."""
+    def lights(self, lights: LightsOfOneDirection) -> list[mi.Spectrum]:
+        """Return the changes of the irradiance in all voxels of points and spots, and 0 for suns,
+        whose radiance `incoming` includes.
+        """
         found = []
-        for emitter, irradiance in zip(transport.point_lights, transport.from_points, strict=True):
+        pairs = zip(lights.emitters, lights.irradiance, strict=True)
+        for number, (emitter, irradiance) in enumerate(pairs):
             factor = [0.0] * dr.size_v(mi.Spectrum)
             channel = 0
-            if emitter in self._changes:
+            if number < lights.points and emitter in self._changes:
                 channel, factor = _relative(*self._changes[emitter])
             factors = mi.Spectrum([dr.opaque(mi.Float, f) for f in factor])
             found.append(factors * irradiance[channel])
@@ -56,8 +60,8 @@ class EmitterTangents:
         if self._environment is None and not any(sun in self._changes for sun in suns):
             return None
         directions, incoming, *_ = transport.ordinates
-        tracks, result = transport.sun_tracks, np.zeros((len(directions), 2, transport.channels))
-        end = len(directions) - len(suns) * tracks
+        result = np.zeros((len(directions), 2, transport.channels))
+        tracks, end = transport.lights.sun_tracks, transport.lights.even
         for number, sun in enumerate(suns):
             if sun in self._changes:
                 rows = slice(end + number * tracks, end + (number + 1) * tracks)

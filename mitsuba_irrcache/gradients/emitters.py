@@ -17,7 +17,6 @@ import numpy as np
 from mitsuba_irrcache.gradients.resampling import volume_of
 from mitsuba_irrcache.gradients.scattering import Components, OrdinatePart
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.lights.environments import environment_radiance
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 
@@ -46,18 +45,16 @@ class EmitterAdjoint:
         """Accumulate the derivatives through the irradiance of voxels by emitters, where
         ``found.direct`` is the derivative with respect to the direct irradiance of each voxel.
         """
-        for light, emitter in enumerate(transport.point_lights):
+        lights = transport.lights
+        for light, emitter in enumerate(lights.emitters[: lights.points]):
             if emitter in self._wanted:
                 _add_point(light, transport, found)
-        suns = [
-            emitter for emitter in self._scene.emitters() if kind_of(emitter) is EmitterKind.SUN
-        ]
+        suns = lights.emitters[lights.points :]
         if self._environment is None and not any(sun in self._wanted for sun in suns):
             return
         derivatives = self._derivatives_by_ordinates(transport, found)
         directions, incoming, *_ = transport.ordinates
-        tracks = transport.sun_tracks
-        end = len(directions) - len(suns) * tracks
+        tracks, end = lights.sun_tracks, lights.even
         for number, sun in enumerate(suns):
             if sun in self._wanted:
                 rows = derivatives[end + number * tracks : end + (number + 1) * tracks, 0]
@@ -145,14 +142,15 @@ def solid_angles(environment: mi.Emitter, both: np.ndarray, incoming: np.ndarray
 
 def _add_point(light: int, transport: AdjointTransport, found: Derivatives) -> None:
     """Accumulate the derivatives through the irradiance of a point-like light."""
-    emitter, irradiance = transport.point_lights[light], transport.from_points[light]
+    lights = transport.lights
+    emitter, irradiance = lights.emitters[light], lights.irradiance[light]
     at = dr.zeros(mi.Interaction3f, transport.grid.voxel_count)
-    at.p = transport.positions
+    at.p = lights.positions
     _, unattenuated = emitter.sample_direction(at, mi.Point2f(0.5))
     is_lit = unattenuated > 0
     transmittance = dr.select(is_lit, irradiance / dr.select(is_lit, unattenuated, 1), 0)
     share = dr.opaque(mi.Float, volume_of(transport.grid))
-    adjoint = transmittance * transport.derivative_by_point(light, found) * share
+    adjoint = transmittance * lights.derivative(light, found.direct) * share
     dr.eval(at, adjoint)
     with dr.resume_grad():
         _, value = emitter.sample_direction(at, mi.Point2f(0.5))

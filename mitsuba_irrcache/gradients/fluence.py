@@ -129,7 +129,7 @@ class FluenceFields:
         ``components`` are those that `_cached` returns, which lack the higher moments of narrow
         sources and of direct ``lights``.
         """
-        scattering, p = self._transport.scattering, self._transport.positions
+        scattering, p = self._transport.scattering, self._transport.lights.positions
         result = components[: scattering.count]
         if self._cache.directional is None:
             return result

@@ -343,23 +343,22 @@ class MediumAdjoint:
             total = sum(np.array(values, dtype=np.float64).sum() for values in found.g)
             result[MEAN_COSINE] = mi.Float(total * volume_of(self.grid))
         if SIGMA_T in self._sums:
-            for light in range(len(transport.point_lights)):
+            for light in range(len(transport.lights.emitters)):
                 result[SIGMA_T] = result[SIGMA_T] + self._along_paths_to_light(light, found)
         return self._at_data(result) | placed
 
     def _along_paths_to_light(self, light: int, found: Derivatives) -> mi.Float:
-        """Return derivatives through the extinction between a point-like light and the voxels."""
-        grid, transport = self.grid, self.transport
-        share = dr.opaque(mi.Float, -volume_of(grid))
-        worth = transport.derivative_by_point(light, found)
-        removed = transport.from_points[light] * worth * share
+        """Return derivatives through the extinction between an emitter and the voxels."""
+        grid, lights = self.grid, self.transport.lights
+        # A single channel that represents all holds the sum of their derivatives.
+        several = dr.size_v(mi.Spectrum) // self.transport.channels
+        share = dr.opaque(mi.Float, -volume_of(grid) / several)
+        removed = lights.irradiance[light] * lights.derivative(light, found.direct) * share
         dr.eval(removed)
         diagonal = float(np.linalg.norm(grid.side_lengths))
         bound = float(dr.max(dr.max(dr.abs(removed)))[0]) * grid.voxel_count * diagonal * 3
-        splat, emitter = self._splat(SIGMA_T, bound * MARGIN), transport.point_lights[light]
-        add_paths_to_light(
-            self.medium, emitter, transport.positions, removed, self.march.step, splat
-        )
+        splat, emitter = self._splat(SIGMA_T, bound * MARGIN), lights.emitters[light]
+        add_paths_to_light(self.medium, emitter, lights.positions, removed, self.march.step, splat)
         return splat.values()
 
 

@@ -27,19 +27,21 @@ def by_position(
     emitter: mi.Emitter, medium: MediumGrid, transport: AdjointTransport, found: Derivatives
 ) -> np.ndarray:
     """Return the derivatives (3) with respect to the position of a point-like light."""
-    light = next(i for i, e in enumerate(transport.point_lights) if e == emitter)
+    light = next(i for i, e in enumerate(transport.lights.emitters) if e == emitter)
     step = STEP * float(transport.grid.voxel_size.min())
 
     def irradiance(shift: np.ndarray) -> mi.Spectrum:
         at = dr.zeros(mi.Interaction3f, transport.grid.voxel_count)
-        at.p = transport.positions - mi.Vector3f(*(dr.opaque(mi.Float, float(s)) for s in shift))
+        at.p = transport.lights.positions - mi.Vector3f(
+            *(dr.opaque(mi.Float, float(s)) for s in shift)
+        )
         record, value = emitter.sample_direction(at, mi.Point2f(0.5))
-        ray = mi.Ray3f(transport.positions, record.d)
+        ray = mi.Ray3f(transport.lights.positions, record.d)
         lit = dr.max(value) > 0
         through = mi.Spectrum(medium_transmittance(medium, ray, record.dist, lit))
         return dr.select(lit, value * through, 0)
 
-    worth = transport.derivative_by_point(light, found)
+    worth = transport.lights.derivative(light, found.direct)
     return _differences(irradiance, step, worth) * volume_of(transport.grid)
 
 
@@ -54,7 +56,7 @@ def by_direction(
         own = towards - change
         own /= np.linalg.norm(own)
         direction = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in own))
-        ray = mi.Ray3f(transport.positions, direction)
+        ray = mi.Ray3f(transport.lights.positions, direction)
         through = medium_transmittance(medium, ray, mi.Float(dr.inf), mi.Bool(True))
         return value * mi.Spectrum(through)
 

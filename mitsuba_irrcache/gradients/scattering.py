@@ -45,6 +45,15 @@ class OrdinatePart:
         """Return the ordinates with the incoming radiance of these channels only."""
         return with_channels(self.ordinates, channels)
 
+    def before(self, end: int, channels: Sequence[int]) -> Ordinates:
+        """Return the ordinates that precede index ``end`` of the whole set, as `with_channels`."""
+        own = Ordinates(*(values[self.rows < end] for values in self.ordinates))
+        return with_channels(own, channels)
+
+    def receives(self, row: int) -> bool:
+        """Return whether radiance that enters along an ordinate of the whole set is of the part."""
+        return bool(self.ordinates.incoming[self.rows == row].any())
+
 
 def split(values: mi.Float, count: int) -> Components:
     """Return ``count`` components that are stored one after the other in an array."""

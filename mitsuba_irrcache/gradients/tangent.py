@@ -62,13 +62,13 @@ class ImageTangent:
             *(fields.get(role) for role in roles), transport.albedo
         )
         dr.eval(sigma_t, collided, emitted)
-        tangents = VoxelTangents(g=self._g, points=self._emitters.points(transport))
+        tangents = VoxelTangents(g=self._g, lights=self._emitters.lights(transport.lights))
         if SIGMA_T in fields:
             tangents.sigma_t = list(sigma_t)
-            tangents.points = [
+            tangents.lights = [
                 change - irradiance * self._depth_to_light(light)
                 for light, (change, irradiance) in enumerate(
-                    zip(tangents.points, transport.from_points, strict=True)
+                    zip(tangents.lights, transport.lights.irradiance, strict=True)
                 )
             ]
         if fields.keys() & {SIGMA_T, ALBEDO}:
@@ -76,18 +76,18 @@ class ImageTangent:
         if EMISSION in fields:
             tangents.emitted = list(emitted)
         tangents.incoming = self._emitters.incoming(transport)
-        dr.eval(tangents.points)
+        dr.eval(tangents.lights)
         of = FluenceTangent(transport, adjoint.fluence.collided, adjoint.extinction, tangents)
         return ChangesOfVoxels(adjoint.grid, of.for_camera())
 
     def _depth_to_light(self, light: int) -> mi.Spectrum:
-        """Return the change of the optical depth between all voxels and a point-like light."""
-        adjoint, transport = self._adjoint, self._adjoint.transport
+        """Return the change of the optical depth between all voxels and an emitter."""
+        adjoint, lights = self._adjoint, self._adjoint.transport.lights
         voxels = adjoint.grid.voxel_count
         reader = add_paths_to_light(
             adjoint.medium,
-            transport.point_lights[light],
-            transport.positions,
+            lights.emitters[light],
+            lights.positions,
             mi.Spectrum(dr.opaque(mi.Float, 1, voxels)),
             adjoint.march.step,
             FieldReader(mi.Spectrum(dr.zeros(mi.Float, voxels)), self._fields[SIGMA_T]),

@@ -31,7 +31,7 @@ class VoxelTangents:
             the voxel, by channel.
         emitted: of the emission coefficient, by channel.
         g: of the mean cosine of the phase function.
-        points: of the irradiance of each point-like light in the voxels.
+        lights: of the irradiance of each emitter of one direction in the voxels.
         incoming: of the irradiance (n, 2, channels) that enters along the ordinates; None for none.
     """
 
@@ -39,7 +39,7 @@ class VoxelTangents:
     collided: list[mi.Float] = field(default_factory=list)
     emitted: list[mi.Float] = field(default_factory=list)
     g: float = 0.0
-    points: list[mi.Spectrum] = field(default_factory=list)
+    lights: list[mi.Spectrum] = field(default_factory=list)
     incoming: np.ndarray | None = None
 
 
@@ -120,9 +120,8 @@ class FluenceTangent:
                 if tangents.incoming is not None:
                     found = _sum(found, self._entering(level, part, channel))
             parts.append(found)
-        for light, change in enumerate(tangents.points):
-            number = transport.part_of_point(light)
-            towards = transport.towards_point(light)
+        for light, change in enumerate(tangents.lights):
+            number, towards = transport.lights.parts[light], transport.lights.towards(light)
             own = transport.scattering.from_direction(change[channel], towards)
             parts[number] = _sum(parts[number], own)
         dr.eval(parts)
@@ -137,8 +136,10 @@ class FluenceTangent:
     ) -> Components:
         """Return the collisions of what a change of the extinction adds along all ordinates."""
         transport, scattering = self._transport, self._transport.scattering
-        directions, incoming, weights, offsets = part.with_channels([channel])
+        directions, incoming, weights, offsets = part.before(transport.lights.even, [channel])
         source = self._zeros()
+        if not len(directions):
+            return source
         if not (number or transport.single):
             scale = transport.albedo[channel] * dr.inv_four_pi
             source = scattering.scattered(self._phi[channel], scale)

@@ -17,11 +17,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.gradients.lights import LightsOfOneDirection
 from mitsuba_irrcache.gradients.parameters import EMISSION, MEAN_COSINE, SIGMA_T
 from mitsuba_irrcache.gradients.phase_function import NeighbouringPhases
 from mitsuba_irrcache.gradients.scattering import Components, scattering_of, with_channels
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.falloff import InverseSquareFactor, VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
@@ -111,33 +111,24 @@ class AdjointTransport:
             (self.ordinates,) = illumination.ordinates(1, pairs, rng)
             self.colour = np.ones(colours)
         self.parts = self.scattering.parts(self.ordinates)
-        #: number of ordinates of each sun; those of suns are the last ones
-        self.sun_tracks = illumination.sun_pairs(pairs) // max(illumination.sun_count, 1)
         self.channels = self.ordinates.incoming.shape[-1] if settings.grey else colours
         solving_pairs = min(pairs, self.scattering.solving_pairs)
         (solving,) = illumination.ordinates(1, solving_pairs, rng)
         self.solving = solving.scattering().without_incoming()
-        voxels = dr.arange(mi.UInt32, grid.voxel_count)
-        self.positions = VoxelSamplePoints(scene, grid).of(voxels)
-        self.point_lights = illumination.point_lights
-        self._point_parts = self.scattering.point_parts(len(self.point_lights))
-        #: irradiance of each point-like light at the voxel centres; below, means over the voxels
-        self.at_centres = illumination.point_irradiance(medium, self.positions)
-        falloff = InverseSquareFactor.of(scene, grid) if self.at_centres else None
-        mean = falloff.spread(voxels) if falloff is not None else mi.Float(1)
-        self.from_points = [irradiance * mean for irradiance in self.at_centres]
-        dr.eval(self.at_centres, self.from_points)
+        #: emitters without extent
+        self.lights = LightsOfOneDirection(scene, medium, grid, self.scattering, illumination)
+        self.lights.add_suns(self.ordinates, self.parts, illumination.sun_pairs(pairs))
         #: the equation of channels that are swept together, and the indices of these channels
-        self.levels = self._new_levels(medium, grid, voxels)
+        self.levels = self._new_levels(medium, grid)
 
     def _new_levels(
-        self, medium: MediumGrid, grid: Grid, voxels: mi.UInt32
+        self, medium: MediumGrid, grid: Grid
     ) -> list[tuple[MultigridLevel, tuple[int, ...]]]:
         detail = extinction_grid(medium, grid)
         extinction = resampled(medium, medium.sigma_t, detail)
         mean = resampled(medium, medium.sigma_t, grid) if detail is not grid else extinction
         plain = resampled(medium, medium.albedo, grid)
-        albedo = collision_albedo(medium, grid, voxels)
+        albedo = collision_albedo(medium, grid, dr.arange(mi.UInt32, grid.voxel_count))
         # In empty voxels there are no collisions to average over; the albedo is that of the data.
         none = [s <= 0 for s in mean]
         albedo = [
@@ -174,7 +165,7 @@ class AdjointTransport:
             found, swept = (self.scattering.separated(v, len(own)) for v in level.sweep(phi, table))
             for c, components, own_collided in zip(own, found, swept, strict=True):
                 centres.append(self._with_narrow_sources(level, c, components))
-                collided.append(self._with_points(c, own_collided))
+                collided.append(self.lights.with_points(c, own_collided))
             dr.eval(centres, collided)
         return centres, collided
 
@@ -187,10 +178,10 @@ class AdjointTransport:
         subtracted, and the irradiance of each of these is appended.
         """
         irradiance, *higher = components
-        irradiance = irradiance + sum((e[channel] for e in self.at_centres), mi.Float(0))
-        narrow, points = [], iter(self.at_centres)
+        irradiance = irradiance + sum((e[channel] for e in self.lights.at_positions), mi.Float(0))
+        narrow, points = [], iter(self.lights.at_positions)
         for number, part in enumerate(self.parts[1:], 1):
-            if number in self._point_parts:
+            if number in self.lights.parts[: self.lights.points]:
                 narrow.append(next(points)[channel])
                 continue
             table = level.tracks.table(*part.with_channels([channel]))
@@ -198,33 +189,6 @@ class AdjointTransport:
             higher = [a - b for a, b in zip(higher, moments, strict=True)]
             narrow.append(own)
         return [irradiance, *higher, *narrow]
-
-    def _with_points(self, channel: int, components: Components) -> Components:
-        """Add the radiance of point-like lights to the ``components`` of collisions."""
-        from_lights = [
-            self.scattering.from_direction(irradiance[channel], self.towards_point(light))
-            for light, irradiance in enumerate(self.from_points)
-        ]
-        if not from_lights:
-            return components
-        return [a + sum(own) for a, *own in zip(components, *from_lights, strict=True)]
-
-    def towards_point(self, light: int) -> mi.Vector3f:
-        """Return the direction from each voxel to a point-like light, given its index."""
-        at = dr.zeros(mi.Interaction3f, self.grid.voxel_count)
-        at.p = self.positions
-        return self.point_lights[light].sample_direction(at, mi.Point2f(0.5))[0].d
-
-    def part_of_point(self, light: int) -> int:
-        """Return the index of the part of the radiance to which a point-like light belongs."""
-        return self._point_parts[light]
-
-    def derivative_by_point(self, light: int, found: Derivatives) -> mi.Spectrum:
-        """Return the derivatives with respect to the irradiance of a point-like light, by voxel."""
-        direction, part = self.towards_point(light), self._point_parts[light]
-        return mi.Spectrum(
-            *(self.scattering.into(direct[part], direction) for direct in found.direct)
-        )
 
     # The adjoint
 
@@ -313,11 +277,11 @@ class AdjointTransport:
         dr.eval(source, adjoint)
         total = dr.zeros(mi.Float, self.grid.voxel_count)
         for number, (part, own) in enumerate(zip(self.parts, adjoint, strict=True)):
-            if len(part.rows):
+            # Of suns, `add_paths_to_light` has these derivatives.
+            ordinates = part.before(self.lights.even, [channel])
+            if len(ordinates.directions):
                 scattered = none if number else source
-                total = self._add_products(
-                    total, level, part.with_channels([channel]), scattered, own
-                )
+                total = self._add_products(total, level, ordinates, scattered, own)
         return total
 
     def _add_products(
@@ -332,7 +296,7 @@ class AdjointTransport:
         scattering, tracks = self.scattering, level.tracks
         directions, incoming, weights, offsets = ordinates
         forward = tracks.table(directions, incoming, weights, offsets)
-        # Ordinates of suns have no weight in sums over directions, but contribute to the products.
+        # Ordinates of bright spots have no weight in sums, but contribute to the products.
         backward = tracks.table(directions, 0 * incoming, np.ones_like(weights), offsets)
         dr.eval(source, adjoint)
         swept = list(adjoint)

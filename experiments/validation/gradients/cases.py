@@ -84,6 +84,12 @@ class Case:
     #: directions of the cache; 0: the default
     directions: int = 0
     parameters: tuple[str, ...] = ("sigma_t", "albedo")
+    #: largest perturbation of the extinction, relative to its maximum
+    step: float = 0.03
+    #: camera samples of each pixel, and caches with other random numbers over which both the
+    #: gradient and the differences are averaged
+    samples: int = 64
+    caches: int = 1
     #: further shapes, by their ids
     objects: Callable[[], dict] = field(default=dict)
 
@@ -213,7 +219,7 @@ def anisotropic() -> dict[str, Case]:
     empty = {"empty_beyond": 0.5, "changed": (0.75, 0.85)}
     return found | {
         "hg 0.3, point": Case(g=0.3, emitters=_under(point=POINT)),
-        "hg 0.3, point in the medium": Case(g=0.3, emitters=_under(point=LAMP)),
+        "hg 0.3, point in the medium": Case(g=0.3, emitters=_under(point=LAMP), samples=1024),
         "hg 0.6, spot": Case(g=0.6, emitters=lambda: {"spot": spot()}),
         "hg 0.6, coloured albedo": Case(g=0.6, emitters=both, albedo=(0.6, 0.75, 0.85)),
         "hg 0.3, coloured extinction": Case(g=0.3, extinction=(0.5, 0.8, 1.0), **COLOURED),
@@ -292,7 +298,7 @@ def surrounded() -> dict[str, Case]:
     """Cases with surfaces, area emitters and several media.
 
     The irradiance of the cache has random noise there, which differences of images share only in
-    part: it has many directions.
+    part: it has many directions, and perturbations are larger.
     """
     colour = {"type": "rgb", "value": [0.6, 0.5, 0.4]}
     both = ("sigma_t", "albedo")
@@ -310,7 +316,7 @@ def surrounded() -> dict[str, Case]:
         "distant object, empty voxels": Case(
             empty_beyond=0.5, changed=(0.75, 0.85), objects=distant, parameters=("sigma_t",)
         ),
-        "room, sky": Case(objects=room, parameters=(*both, "left")),
+        "room, sky": Case(objects=room, parameters=(*both, "left"), samples=256, caches=3),
         "lamp": Case(emitters=dict, objects=lamp, parameters=(*both, "lamp")),
         "lamp over a ground": Case(
             emitters=dict, objects=lambda: ground() | lamp(), parameters=(*both, "floor", "lamp")
@@ -322,7 +328,7 @@ def surrounded() -> dict[str, Case]:
             emitters=_under(sun=SUN), objects=lambda: second_medium(0.002)
         ),
     }
-    return {name: replace(case, directions=256) for name, case in found.items()}
+    return {name: replace(case, directions=256, step=0.12) for name, case in found.items()}
 
 
 COLOURED = {"albedo": (0.6, 0.75, 0.85), "emitters": _under(sky=SKY)}
@@ -335,8 +341,8 @@ CASES = {
     "sky and sun": Case(emitters=_under(sky=SKY, sun=SUN)),
     "point, single": Case(max_depth=2, emitters=_under(point=POINT)),
     "point": Case(emitters=_under(point=POINT)),
-    "point in the medium, single": Case(max_depth=2, emitters=_under(point=LAMP)),
-    "point in the medium": Case(emitters=_under(point=LAMP)),
+    "point in the medium, single": Case(max_depth=2, emitters=_under(point=LAMP), samples=1024),
+    "point in the medium": Case(emitters=_under(point=LAMP), samples=1024),
     "spot, single": Case(max_depth=2, emitters=lambda: {"spot": spot()}),
     "spot": Case(emitters=lambda: {"spot": spot()}),
     "envmap with a bright spot": Case(emitters=lambda: {"sky": sky_with_sun()}),

@@ -10,9 +10,10 @@ import numpy as np
 
 from experiments.validation.gradients.cases import EDGE, Case, blob
 
-#: Camera samples of each pixel, for images and for gradients.
-SPP, SPP_GRAD = 64, 64
-#: Perturbations of a grid, their width in edges of it, and their step relative to its maximum.
+#: Camera samples of each pixel for gradients, if nothing else is said.
+SPP_GRAD = 64
+#: Perturbations of a grid, their width in edges of it, and the largest change of an albedo or of
+#: emission, relative to 1 or to the maximum.
 BLOBS, WIDTH, STEP = 6, 0.12, 0.03
 
 
@@ -80,7 +81,11 @@ def gradients(
 
 
 def derivatives(
-    scene: mi.Scene, name: str, weights: np.ndarray, steps: list[np.ndarray]
+    scene: mi.Scene,
+    name: str,
+    weights: np.ndarray,
+    steps: list[np.ndarray],
+    spp: int = SPP_GRAD,
 ) -> np.ndarray:
     """Derivatives of the objective along ``steps`` of a parameter, by forward mode."""
     params = mi.traverse(scene)
@@ -93,7 +98,7 @@ def derivatives(
         params.update()
         flat = np.broadcast_to(step, shape).astype(np.float32)
         dr.set_grad(leaf, kind(flat if len(shape) != 1 else flat.ravel()))
-        change = dr.forward_to(mi.render(scene, params, spp=SPP_GRAD, seed=3))
+        change = dr.forward_to(mi.render(scene, params, spp=spp, seed=3))
         found.append(float((np.array(change, dtype=np.float64) * weights).sum()))
         params[key] = dr.detach(leaf)
         params.update()
@@ -120,7 +125,8 @@ def directions(case: Case, name: str, value: np.ndarray, count: int) -> list[np.
         plane = np.where(plane < 1e-2, 0, plane)
         colour = rng.uniform(0.3, 1.0, value.shape[-1])
         peak = case.depth * case.data / EDGE
-        step = STEP * {"sigma_t": peak, "albedo": 1.0}.get(name, value.max())
+        steps = {"sigma_t": case.step * peak, "albedo": STEP}
+        step = steps.get(name, STEP * value.max())
         found.append(step * plane * colour / colour.max())
     return found
 
@@ -144,7 +150,7 @@ def compare(
         flat = changed.astype(np.float32)
         params[key] = kind(flat if value.ndim != 1 else flat.ravel())
         params.update()
-        image = np.array(mi.render(scene, spp=SPP, seed=7), dtype=np.float64)
+        image = np.array(mi.render(scene, spp=case.samples, seed=7), dtype=np.float64)
         return float((image * weights).sum())
 
     found = []
@@ -158,3 +164,19 @@ def compare(
         found.append((difference, worth))
     objective(value)
     return Comparison(*np.array(found).T)
+
+
+def mean_of(found: list[Comparison]) -> tuple[Comparison, float]:
+    """Average comparisons with other random numbers.
+
+    Returns also the standard error of the difference between both means, relative to these; NaN
+    for a single comparison.
+    """
+    differences, adjoint = (
+        np.array([getattr(each, name) for each in found]) for name in ("differences", "adjoint")
+    )
+    mean = Comparison(differences.mean(axis=0), adjoint.mean(axis=0))
+    if len(found) == 1:
+        return mean, float("nan")
+    deviations = (adjoint - differences).std(axis=0, ddof=1) / np.sqrt(len(found))
+    return mean, float(np.linalg.norm(deviations) / np.linalg.norm(mean.differences))

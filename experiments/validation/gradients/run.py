@@ -28,6 +28,7 @@ from experiments.validation.gradients.differences import (
     directions,
     gradients,
     key_of,
+    mean_of,
     pixel_weights,
 )
 from mitsuba_irrcache.compare.tables import Table
@@ -79,25 +80,40 @@ def among_surfaces(chosen: str) -> Table:
     cells = []
     for name, case in SURROUNDED.items():
         if chosen in name:
-            scene = case.load()
-            weights = pixel_weights(scene)
-            begun = process_time()
-            found = gradients(scene, case.parameters, weights)
-            seconds = process_time() - begun
-            for parameter, gradient in found.items():
-                result = compare(scene, case, parameter, weights, gradient, FEWER_BLOBS)
-                row = f"{result.error:.2%}", f"{result.cosine:.5f}", f"{seconds:.2f}"
-                cells.append([name, parameter, *row])
-                print("  ".join(cells[-1]), flush=True)
-    head = ["case", "parameter", "error", "cosine", "CPU s"]
-    return Table("Gradients among surfaces and several media", head, cells)
+            for row in _rows_among_surfaces(name, case):
+                cells.append(row)
+                print("  ".join(row), flush=True)
+    head = ["case", "parameter", "error", "noise", "cosine", "CPU s"]
+    note = f"Room: means over {SURROUNDED['room, sky'].caches} caches, whose noise is given."
+    return Table("Gradients among surfaces and several media", head, cells, note)
+
+
+def _rows_among_surfaces(name: str, case: Case) -> list[list[str]]:
+    found: dict[str, list] = {parameter: [] for parameter in case.parameters}
+    seconds = 0.0
+    for seed in range(case.caches):
+        scene = case.load(cache_seed=seed)
+        weights = pixel_weights(scene)
+        begun = process_time()
+        own = gradients(scene, case.parameters, weights, case.samples, 3 + seed)
+        seconds += (process_time() - begun) / case.caches
+        for parameter, gradient in own.items():
+            result = compare(scene, case, parameter, weights, gradient, FEWER_BLOBS)
+            found[parameter].append(result)
+    rows = []
+    for parameter, results in found.items():
+        mean, noise = mean_of(results)
+        shown = "" if np.isnan(noise) else f"{noise:.2%}"
+        cells = f"{mean.error:.2%}", shown, f"{mean.cosine:.5f}", f"{seconds:.2f}"
+        rows.append([name, parameter, *cells])
+    return rows
 
 
 def _rows(name: str, case: Case) -> list[list[str]]:
     scene = case.load()
     weights = pixel_weights(scene)
     begun = process_time()
-    found = gradients(scene, case.parameters, weights)
+    found = gradients(scene, case.parameters, weights, case.samples)
     seconds = process_time() - begun
     rows = []
     for parameter, gradient in found.items():
@@ -105,7 +121,9 @@ def _rows(name: str, case: Case) -> list[list[str]]:
         params = mi.traverse(scene)
         value = np.array(params[key_of(params, parameter)], dtype=np.float64)
         steps = directions(case, parameter, value, BLOBS)
-        forward = replace(result, adjoint=derivatives(scene, parameter, weights, steps))
+        forward = replace(
+            result, adjoint=derivatives(scene, parameter, weights, steps, case.samples)
+        )
         cells = f"{result.error:.2%}", f"{result.cosine:.5f}", f"{forward.error:.2%}"
         rows.append([name, parameter, *cells, f"{seconds:.2f}"])
     return rows

@@ -1,0 +1,92 @@
+"""Points, spots and suns: emitters whose radiance comes from one direction at each position."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.gradients.scattering import Components, IsotropicScattering, OrdinatePart
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
+from mitsuba_irrcache.lights.falloff import InverseSquareFactor, VoxelSamplePoints
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
+from mitsuba_irrcache.transport.tracking import medium_transmittance
+
+
+class LightsOfOneDirection:
+    """All points and spots of ``scene``, followed by its suns.
+
+    Attributes:
+        emitters: the emitters; ``points`` is the number of those that are not suns.
+        positions: where each voxel is irradiated.
+        at_positions: irradiance there of each point and spot.
+        irradiance: irradiance of each emitter in the voxels: means for points and spots.
+        parts: index of the part of the radiance to which each emitter belongs.
+        even: number of ordinates that precede those of suns; each sun has ``sun_tracks``.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        grid: Grid,
+        scattering: IsotropicScattering,
+        illumination: DistantIllumination,
+    ) -> None:
+        self._scattering = scattering
+        suns = EmittersByKind(scene.emitters()).of(EmitterKind.SUN)
+        self.points = len(illumination.point_lights)
+        self.emitters = [*illumination.point_lights, *suns]
+        voxels = dr.arange(mi.UInt32, grid.voxel_count)
+        self.positions = VoxelSamplePoints(scene, grid).of(voxels)
+        self.at_positions = illumination.point_irradiance(medium, self.positions)
+        falloff = InverseSquareFactor.of(scene, grid) if self.at_positions else None
+        mean = falloff.spread(voxels) if falloff is not None else mi.Float(1)
+        self.irradiance = [irradiance * mean for irradiance in self.at_positions]
+        dr.eval(self.at_positions, self.irradiance)
+        self.parts = scattering.point_parts(self.points)
+        self._medium = medium
+
+    def add_suns(self, ordinates: Ordinates, parts: Sequence[OrdinatePart], pairs: int) -> None:
+        """Compute the irradiance of the suns, whose ``pairs`` of ordinates are the last ones."""
+        suns = len(self.emitters) - self.points
+        self.sun_tracks = pairs // max(suns, 1)
+        self.even = len(ordinates.directions) - pairs
+        for number in range(suns):
+            first = self.even + number * self.sun_tracks
+            entering = ordinates.incoming[first : first + self.sun_tracks].sum(axis=(0, 1))
+            values = mi.Spectrum(*(dr.opaque(mi.Float, float(v)) for v in entering))
+            ray = mi.Ray3f(self.positions, self.towards(self.points + number))
+            through = medium_transmittance(self._medium, ray, mi.Float(dr.inf), mi.Bool(True))
+            self.irradiance.append(values * mi.Spectrum(through))
+            own = (n for n, part in enumerate(parts) if part.receives(first))
+            self.parts.append(next(own, 0))
+        dr.eval(self.irradiance)
+
+    def towards(self, light: int) -> mi.Vector3f:
+        """Return the direction from each voxel to an emitter, given its index."""
+        at = dr.zeros(mi.Interaction3f, dr.width(self.positions))
+        at.p = self.positions
+        return self.emitters[light].sample_direction(at, mi.Point2f(0.5))[0].d
+
+    def derivative(self, light: int, direct: list[list[Components]]) -> mi.Spectrum:
+        """Return the derivatives with respect to the irradiance of an emitter, by voxel.
+
+        ``direct`` is that of `Derivatives`.
+        """
+        direction, part = self.towards(light), self.parts[light]
+        return mi.Spectrum(*(self._scattering.into(own[part], direction) for own in direct))
+
+    def with_points(self, channel: int, components: Components) -> Components:
+        """Add the radiance of points and spots to the ``components`` of collisions."""
+        from_lights = [
+            self._scattering.from_direction(self.irradiance[light][channel], self.towards(light))
+            for light in range(self.points)
+        ]
+        if not from_lights:
+            return components
+        return [a + sum(own) for a, *own in zip(components, *from_lights, strict=True)]
