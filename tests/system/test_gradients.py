@@ -52,7 +52,8 @@ def check(case: Case, error: float = ERROR) -> None:
 
 @pytest.mark.parametrize("name", GREY)
 def test_gradients_are_those_of_the_image(mono, name):
-    check(CASES[name])
+    # Lines to a sun or point are exact: tracks in their place would have an error of 1 %.
+    check(CASES[name], 0.005 if name == "sun, single" else ERROR)
 
 
 @pytest.mark.parametrize("name", COLOURED)
