@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.support.surfaces import ball, blocks, bound, diffuse, fog, images, placed, ref
+from tests.support.surfaces import ball, blocks, bound, diffuse, fog, images, lamp, placed, ref
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -197,3 +197,31 @@ def test_edited_objects_are_solved_for_anew(scenes):
     edited = ball((-0.3, 0, 0.1), 0.3, bsdf=diffuse(0.1, 0.7, 0.9))
     fresh = scenes.load(integrator, None, **(objects | {"object": edited}))
     np.testing.assert_allclose(found, scenes.image(fresh, spp=4), rtol=2e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("towards", [1, -1])
+def test_lamps_may_lie_anywhere_in_a_voxel(scenes, towards):
+    """The irradiance a few voxels from a black lamp does not depend on how it divides a voxel.
+
+    When such a voxel had the mean irradiance of both sides, and its part on the other side that of
+    the next voxel, it was 2 to 3 % too dark in front of the lamp, and 30 % too bright behind it.
+    """
+    within = {"interior": ref("fog"), "exterior": ref("fog")}
+    objects = {
+        "fog": fog(albedo=(1, 1, 1)),
+        "box": bound("cube", ref("fog")),
+        "emitter": lamp((0, 0.03, 0), (0, 0.03 + towards, 0.001), radiance=(1, 1, 1))
+        | {"bsdf": diffuse(0, 0, 0)} | within,
+    }  # fmt: skip
+    # The lamp is at 0.7 of one of 13 voxels, at 0.4 of one of 26.
+    sides = []
+    for voxels in (13, 26):
+        integrator = {"type": "irrcache", "solver": "sweep", "resolution": voxels}
+        scene = scenes.load(integrator | {"cache_spp": 128}, None, **objects)
+        scene.integrator().prepare(scene)
+        scattered = np.array(scene.integrator().cache.scattered)[..., 0].mean(axis=(0, 2))
+        layers = scattered.reshape(13, -1).mean(axis=1)[::towards]
+        sides.append((layers[9:].mean(), layers[:4].mean()))
+    (front, behind), (fine_front, fine_behind) = sides
+    assert front == pytest.approx(fine_front, rel=0.015)
+    assert behind == pytest.approx(fine_behind, rel=0.1)

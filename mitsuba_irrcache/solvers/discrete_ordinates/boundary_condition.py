@@ -37,6 +37,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.crossings import (
     SurfaceVoxels,
     voxel_at,
 )
+from mitsuba_irrcache.solvers.discrete_ordinates.cut_voxel_light import CutVoxelLight
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
@@ -85,6 +86,8 @@ class SurfaceBoundary:
         self.angular_basis = angular_basis
         #: whether radiance is refracted when it enters the medium, and reflected inside
         self.refracts = medium.refracts
+        #: light of emitters in closed form in cut voxels; None without any
+        self.cut_voxel_light: CutVoxelLight | None = None
         #: whether tracks carry refracted radiance of emitters; otherwise see `refracted_light`
         self.carries_refracted = True
         self._depths = dr.opaque(mi.UInt32, 0xFFFFFFFF), dr.opaque(mi.UInt32, rr_depth)
@@ -414,8 +417,25 @@ def _trace_cells(
     found = _trace(boundary, incoming, rays, distant, paths)
     if incoming.crossings is not None and incoming.crossings.count:
         rays = _crossing_rays(boundary, incoming.crossings, parameters, seed)
-        found = _joined(found, _trace(boundary, incoming, rays, distant, paths))
+        at_crossings = _trace(boundary, incoming, rays, distant, paths)
+        if paths and boundary.cut_voxel_light is not None:
+            at_crossings = _with_hidden_parts(boundary, incoming.crossings, rays, at_crossings)
+        found = _joined(found, at_crossings)
     return found
+
+
+def _with_hidden_parts(
+    boundary: SurfaceBoundary, crossings: SurfaceCrossings, rays: tuple, found: tuple
+) -> tuple:
+    """Add to the result of `_trace` for ``crossings`` the radiance that is scattered once on the
+    other side of cut voxels, see `CutVoxelLight`.
+    """
+    weight, rng = rays[1], rays[4]
+    radiance = boundary.cut_voxel_light.along_hidden_parts(crossings, mi.PCG32(rng))
+    unscattered, emitted, *rest = found
+    emitted = [e + weight * r for e, r in zip(emitted, radiance, strict=True)]
+    dr.eval(emitted)
+    return unscattered, emitted, *rest
 
 
 def _crossing_rays(
@@ -523,7 +543,13 @@ def _trace_all(
         if boundary.surfaces is None:
             voxel = voxel_at(incoming.tracks.grid, end.p)
         else:
-            voxel = boundary.surfaces.nearest(end.p, dr.max(end.weight) > 0)
+            collides = dr.max(end.weight) > 0
+            voxel = boundary.surfaces.nearest(end.p, collides)
+            if boundary.cut_voxel_light is not None:
+                own = voxel_at(incoming.tracks.grid, end.p)
+                collides &= boundary.surfaces.is_cut_at(own)
+                more = boundary.cut_voxel_light.scattered_radiance(end.p, voxel, collides)
+                emitted = emitted + weight * end.weight * more
     none = dr.zeros(mi.Float, dr.width(weight))
     unscattered = [[v + none for v in part] for part in unscattered]
     emitted, reflected = ([v + none for v in spectrum] for spectrum in (emitted, reflected))

@@ -92,6 +92,17 @@ class SurfaceVoxels:
             return mi.Bool(False)
         return dr.gather(mi.Bool, self._beyond, voxel, active)
 
+    def hidden(
+        self, voxel: mi.UInt32, centre: mi.Point3f, p: mi.Point3f, active: mi.Bool
+    ) -> tuple[mi.Bool, mi.Normal3f]:
+        """Return whether world positions lie on another side of surfaces than the ``centre`` of
+        their ``voxel``, and the normal of the surface between them.
+        """
+        _, normal, hidden = first_surface(self.scene, centre, p, active)
+        if self.medium is not None:
+            hidden = dr.select(self.is_beyond(voxel), ~self.medium.contains(p), hidden)
+        return hidden, normal
+
     @symbolic
     def nearest(self, p: mi.Point3f, active: mi.Bool):
         """Return the voxel whose value applies at world positions.
@@ -189,12 +200,40 @@ class SurfaceCrossings:
         lane = dr.arange(mi.UInt32, 2 * self.count)
         back, slot = (lane & 1) == 1, lane >> 1
         record = dr.gather(mi.Vector4f, self.records, slot)
-        at = dr.gather(mi.UInt32, self._lanes, slot)
-        number = at // max(self.surfaces.count, 1)
-        segment = _Segment(self, number, at - number * self.surfaces.count)
+        number, segment = self._segment(slot)
         origin = dr.select(back, segment.start, segment.end)
         direction = dr.select(back, 1.0, -1.0) * segment.direction
         return number * 2 + dr.select(back, 1, 0), record.x <= record.y, mi.Ray3f(origin, direction)
+
+    def hidden_parts(self) -> tuple[mi.Point3f, mi.Point3f, mi.UInt32, mi.Bool, mi.Bool]:
+        """Return for each crossing, both ways in turn, the part of the segment behind the surface,
+        or all of it if it does not cross a surface: both ends in world space, the voxel whose
+        source applies to it, whether it is behind a surface, and whether it is hidden from the
+        centre of its voxel.
+        """
+        lane = dr.arange(mi.UInt32, 2 * self.count)
+        back, slot = (lane & 1) == 1, lane >> 1
+        _, segment = self._segment(slot)
+        first, last, before, behind = dr.gather(mi.Vector4f, self.records, slot)
+        voxels = dr.gather(mi.Vector2u, self.sources, slot)
+        crosses = first <= last
+        low, high = -dr.minimum(segment.back, 0.5), dr.minimum(segment.ahead, 0.5)
+        # Tracks that enter through a side begin up to a slice before the middle.
+        low = dr.select(~back, -segment.back, low)
+        high = dr.select(back, segment.ahead, high)
+        begin = dr.select(crosses & ~back, dr.maximum(last, low), low)
+        end = dr.select(crosses & back, dr.minimum(first, high), high)
+        is_before = back | ~crosses
+        hidden = dr.select(is_before, before, behind) < 1
+        voxel = dr.select(is_before, voxels.x, voxels.y)
+        end = dr.maximum(begin, end)
+        return segment.at(begin), segment.at(end), voxel, crosses, hidden
+
+    def _segment(self, slot: mi.UInt32) -> tuple[mi.UInt32, _Segment]:
+        """Return the indices of the ordinates of crossings, and the segments."""
+        at = dr.gather(mi.UInt32, self._lanes, slot)
+        number = at // max(self.surfaces.count, 1)
+        return number, _Segment(self, number, at - number * self.surfaces.count)
 
 
 class _Segment:
@@ -287,10 +326,7 @@ def _side(
     On the other side that is a neighbouring voxel, one voxel away from the surface.
     """
     surfaces, p = crossings.surfaces, segment.at(position)
-    _, normal, hidden = first_surface(surfaces.scene, segment.centre, p, active)
-    if surfaces.medium is not None:
-        beyond = surfaces.is_beyond(segment.voxel)
-        hidden = dr.select(beyond, ~surfaces.medium.contains(p), hidden)
+    hidden, normal = surfaces.hidden(segment.voxel, segment.centre, p, active)
     normal = dr.select(dr.dot(normal, p - segment.centre) > 0, normal, -normal)
     step = surfaces.grid.coordinates.vector(mi.Vector3f(normal))
     step /= dr.maximum(dr.max(dr.abs(step)), 1e-30)

@@ -750,7 +750,8 @@ class _PairSweep:
                 before * dr.fma(x - s, to_centre, s),
                 dr.select(last < 0, behind * dr.fma(y - t, from_surface, t), 0),
             )
-            carried.append(dr.select(crosses, y - lost[1], x - lost[0]))
+            # Without a crossing, y is what the part scatters more than its source.
+            carried.append(dr.select(crosses, y - lost[1], x - lost[0] + y))
             total = (before * lost[0] + behind * lost[1]) * self.area
             tallies.append(mi.Vector4f(0, centre, total, depth))
         return carried, tallies

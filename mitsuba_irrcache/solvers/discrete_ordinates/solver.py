@@ -34,6 +34,7 @@ from mitsuba_irrcache.solvers.base import Progress
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import merged
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
 from mitsuba_irrcache.solvers.discrete_ordinates.crossings import SurfaceVoxels
+from mitsuba_irrcache.solvers.discrete_ordinates.cut_voxel_light import CutVoxelLight
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import emission_irradiance
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import (
     EmitterSampling,
@@ -129,6 +130,8 @@ class Sweep:
             dr.eval(self._inverse_square_mean)
         #: direct lights of the cache, evaluated in closed form, by the identity of their irradiance
         self._closed_form_lights = {id(light.irradiance): light for light in cache.direct_lights}
+        #: the same lights in voxels that surfaces cut; None without any
+        self._cut_voxel_light: CutVoxelLight | None = None
         #: results of sampling voxel by voxel in a batch: from each point-like emitter and from area
         #: emitters, and from emission. Each is a list of the irradiance, and its moments unless
         #: they follow from the direction
@@ -160,6 +163,11 @@ class Sweep:
         self._boundary = SurfaceBoundary(
             scene, medium, large, rr_depth, cache.directional, self._surfaces
         )
+        # Moments of the radiance in cut voxels are those at the centre.
+        if self._surfaces is not None and known and cache.max_depth != 2 and not cache.moments:
+            lights, surfaces = cache.direct_lights, self._surfaces
+            self._cut_voxel_light = CutVoxelLight(lights, medium, surfaces, cache.active)
+            self._boundary.cut_voxel_light = self._cut_voxel_light
         # Crossing glass is a vertex of a path: this source would not fit a limited max_depth.
         isotropic, all_orders = medium.phase.is_isotropic, cache.max_depth < 0
         if medium.refracts and isotropic and all_orders and is_needed(scene):
@@ -485,9 +493,11 @@ class Sweep:
         """Return the irradiance from each emitter that is sampled voxel by voxel, as means over the
         active voxels.
         """
-        known = self._closed_form_lights
+        known = {key: light.means for key, light in self._closed_form_lights.items()}
+        if self._cut_voxel_light is not None:
+            known |= self._cut_voxel_light.means
         direct = [
-            known[id(irradiance)].means[channel]
+            known[id(irradiance)][channel]
             if id(irradiance) in known
             else irradiance[channel] * self._inverse_square_mean
             for irradiance, *_ in self._direct
