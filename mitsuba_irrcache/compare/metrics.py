@@ -25,7 +25,7 @@ def net_mse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[float, flo
 
 def net_rmse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     """Return the RMSE without the reference's noise, sqrt(mean((x - a)(x - b)))."""
-    return _root(net_mse(image, a, b)[0])
+    return root(net_mse(image, a, b)[0])
 
 
 def relative_mse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
@@ -61,17 +61,17 @@ def block_error(image: np.ndarray, a: np.ndarray, b: np.ndarray, size: int = 8) 
     """
     if min(image.shape[:2]) < size:
         return float("nan")
-    return _root(np.mean(block_means(image - a, size) * block_means(image - b, size)))
+    return root(np.mean(block_means(image - a, size) * block_means(image - b, size)))
 
 
 def discretisation_error(x: np.ndarray, y: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     """Return the error common to two independent runs x and y, without their noise."""
-    return _root(np.mean((x - a) * (y - b), dtype=np.float64))
+    return root(np.mean((x - a) * (y - b), dtype=np.float64))
 
 
 def noise(x: np.ndarray, y: np.ndarray) -> float:
     """Return the standard deviation of one run, estimated from two independent ones."""
-    return _root(0.5 * np.mean((x - y) ** 2, dtype=np.float64))
+    return root(0.5 * np.mean((x - y) ** 2, dtype=np.float64))
 
 
 def block_means(image: np.ndarray, size: int) -> np.ndarray:
@@ -81,6 +81,6 @@ def block_means(image: np.ndarray, size: int) -> np.ndarray:
     return cropped.reshape(height, size, width, size, -1).mean(axis=(1, 3))
 
 
-def _root(value: float) -> float:
+def root(value: float) -> float:
     """Return the square root with the sign of x: the estimate of a small square may be negative."""
     return float(np.copysign(np.sqrt(abs(value)), value))
