@@ -64,6 +64,8 @@ class AngularBasis:
         """
         self.phase, self.sources, self.others = phase, sources, others
         self.order = phase.order if order is None else order
+        #: largest ratio of the radiance scattered in a direction to its mean
+        self.largest_ratio = dr.opaque(mi.Float, phase.peak)
         self._factors = [
             dr.opaque(mi.Float, float(4 * np.pi * phase.moments[degree]))
             for degree in range(1, self.order + 1)
@@ -379,7 +381,7 @@ class AngularField:
             extra += sum(w * m for w, m in zip(correction, narrow, strict=False))
             ratio = dr.select(phi > 0, 1 + extra / dr.select(phi > 0, phi, 1), 1)
             # A truncated series may be negative, and noisy moments are unbounded.
-            found.append(dr.clip(ratio, 0, directional.phase.peak))
+            found.append(dr.clip(ratio, 0, directional.largest_ratio))
         return found[0] if self.channels == 1 else mi.Color3f(found)
 
     def _depths_to_camera(
