@@ -71,20 +71,6 @@ class Appearance:
         """Return whether the albedo is that of the file, whatever the mapping says."""
         return self.colours is not None and self.colours.use == "albedo"
 
-    def coarse(self) -> Appearance:
-        """Return the same of every n-th voxel, with about `COARSE` of them along each side."""
-        volume, steps = self.volume, [max(1, round(n / COARSE)) for n in self.volume.values.shape]
-        chosen = tuple(slice(step // 2, None, step) for step in steps)
-        first = [step // 2 for step in reversed(steps)]
-        small = replace(
-            volume,
-            values=volume.values[chosen].copy(),
-            spacing=tuple(np.multiply(volume.spacing, steps[::-1])),
-            origin=tuple((volume.index_to_world @ [*first, 1])[:3]),
-        )
-        colours = self.colours and replace(self.colours, values=self.colours.values[chosen])
-        return Appearance(small, self.mapping, self.preset, colours)
-
     def grids(self, mapping: TransferFunction | DensityMapping) -> dict[str, np.ndarray]:
         """Return extinction (z, y, x[, 3]), albedo (z, y, x, 3) and, where the medium emits, its
         emission (z, y, x, 3), keyed by their file names.
@@ -126,6 +112,26 @@ class Appearance:
         view = camera(self.volume, grids[SIGMA_T_FILE], settings.up)
         text = scene_xml(self.volume.to_world, view, settings, self.is_emissive)
         return Document.of_text(text, grids, parameters, integrator or "irrcache")
+
+
+def coarse_appearance(
+    volume: VolumeData,
+    mapping: TransferFunction | DensityMapping,
+    preset: str = "",
+    colours: Colours | None = None,
+) -> Appearance:
+    """Return the appearance of every n-th voxel, with about `COARSE` of them along each side."""
+    steps = [max(1, round(n / COARSE)) for n in volume.values.shape]
+    chosen = tuple(slice(step // 2, None, step) for step in steps)
+    first = [step // 2 for step in reversed(steps)]
+    small = replace(
+        volume,
+        values=volume.values[chosen].copy(),
+        spacing=tuple(np.multiply(volume.spacing, steps[::-1])),
+        origin=tuple((volume.index_to_world @ [*first, 1])[:3]),
+    )
+    colours = colours and replace(colours, values=colours.values[chosen])
+    return Appearance(small, mapping, preset, colours)
 
 
 def cropped(values: np.ndarray, box: Box) -> np.ndarray:

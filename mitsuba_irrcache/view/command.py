@@ -26,7 +26,7 @@ from mitsuba_irrcache.volumes import importer
 from mitsuba_irrcache.volumes.options import MissingItemError, UnchosenItemError
 
 if TYPE_CHECKING:
-    from mitsuba_irrcache.view.appearance import Appearance
+    from mitsuba_irrcache.view.appearance import Appearance, coarse_appearance
     from mitsuba_irrcache.view.document import Document
     from mitsuba_irrcache.view.server import Server
     from mitsuba_irrcache.view.session import Session
@@ -147,7 +147,7 @@ def _document(args: argparse.Namespace, server: Server) -> tuple[Document, Appea
 
     A coarse image of a volume is displayed as soon as there are values to show.
     """
-    from mitsuba_irrcache.view.appearance import Appearance
+    from mitsuba_irrcache.view.appearance import Appearance, coarse_appearance
     from mitsuba_irrcache.view.document import Document
 
     path, parameters = Path(args.input[0]), parse_parameters(args.define)
@@ -171,9 +171,10 @@ def _document(args: argparse.Namespace, server: Server) -> tuple[Document, Appea
     if small is not None:
         _preview(server, document, Appearance(*small))
     volume, mapping, colours = _read(args)
-    appearance = Appearance(volume, mapping, args.preset or "", colours)
-    if small is None and appearance.volume.values.size > MANY_VOXELS:
-        _preview(server, document, appearance.coarse())
+    described = volume, mapping, args.preset or "", colours
+    if small is None and volume.values.size > MANY_VOXELS:
+        _preview(server, document, coarse_appearance(*described))
+    appearance = Appearance(*described)
     return document(appearance), appearance
 
 

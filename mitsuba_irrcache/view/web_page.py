@@ -16,6 +16,9 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 
 FOLDER = Path(__file__).with_name("page")
+#: How the script of viser's client begins, and what keeps browsers from running it at once: it uses
+#: a processor for a second, in which `overlay.js` shows the first image. Then it is started.
+CLIENT, DEFERRED = "<script data-p=", '<script type="text/viser" data-p='
 SCRIPTS = ("channel.js", "transfer.js", "light.js", "background.js", "overlay.js")
 
 
@@ -33,6 +36,7 @@ def _page(title: str) -> bytes:
     )
     text = re.sub(r'<link\s+rel="icon".*?>', "", text, count=1, flags=re.DOTALL)
     text = re.sub(r"<title>.*?</title>", lambda _: head, text, count=1)
+    text = text.replace(CLIENT, DEFERRED, 1)
     return gzip.compress(text.encode())
 
 

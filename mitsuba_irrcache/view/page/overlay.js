@@ -9,6 +9,7 @@
 (() => {
   const CORNER = 34;
   const PANEL = 324; // width of viser's panel, before it is there
+  const CLIENT_DELAY = 3000; // ms after which viser's client starts even if there is no image yet
   const picture = Object.assign(document.createElement("canvas"), { id: "irrcache-picture" });
   let size = [], connection = 0, pictures = 0, displayed = 0;
   let root, split = 0.5, comparison = { mode: "off" }, shown = null;
@@ -150,10 +151,23 @@
   /** Show an image until the first one for this window arrives; windows that open later have none. */
   function preview(bytes) {
     const image = find("preview");
-    if (!bytes.length || !find("note").hidden) return;
+    if (!bytes.length || !find("note").hidden) return startClient();
     image.hidden = false;
+    image.onload = image.onerror = () => {
+      URL.revokeObjectURL(image.src);
+      window.requestAnimationFrame(startClient); // once the image is visible
+    };
     image.src = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
-    image.onload = image.onerror = () => URL.revokeObjectURL(image.src);
+  }
+
+  /** Start viser's client unless that has been done; see web_page.py. */
+  function startClient() {
+    const script = document.querySelector('script[type="text/viser"]');
+    if (!script) return;
+    const copy = document.createElement("script");
+    Object.assign(copy.dataset, script.dataset);
+    copy.textContent = script.textContent;
+    script.replaceWith(copy);
   }
 
   /** Draw the axes of the scene as the camera sees them, those behind first. */
@@ -186,6 +200,7 @@
       if (text.endsWith("per pixel")) find("preview").hidden = true; // an image, no message
     });
     irrcache.receive("preview", preview);
+    window.setTimeout(startClient, CLIENT_DELAY);
     irrcache.receive("picture", show);
     irrcache.receive("hint", (text) => set("hint", text));
     irrcache.receive("comparison", compare);

@@ -11,7 +11,7 @@ pytest.importorskip("viser")
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view import command
-from mitsuba_irrcache.view.appearance import WHOLE, Appearance, cropped
+from mitsuba_irrcache.view.appearance import WHOLE, Appearance, coarse_appearance, cropped
 from mitsuba_irrcache.view.comparison import (
     CHOICES,
     _finest,
@@ -81,7 +81,7 @@ def test_coarse_volumes_lie_where_the_whole_ones_do():
         1 + z * 1e-3, spacing=(1, 2, 3), origin=(5, 6, 7), direction=np.eye(3)[[1, 0, 2]]
     )
     colours = Colours("albedo", np.stack([x, y, z], axis=-1))
-    coarse = Appearance(volume, DensityMapping(), colours=colours).coarse()
+    coarse = coarse_appearance(volume, DensityMapping(), colours=colours)
     assert max(coarse.volume.size) < 80
     assert coarse.colours.values.shape == (*coarse.volume.values.shape, 3)
     for index in np.ndindex(2, 2, 2):
