@@ -26,7 +26,7 @@ from mitsuba_irrcache.volumes import importer
 from mitsuba_irrcache.volumes.options import MissingItemError, UnchosenItemError
 
 if TYPE_CHECKING:
-    from mitsuba_irrcache.view.appearance import Appearance, coarse_appearance
+    from mitsuba_irrcache.view.appearance import Appearance
     from mitsuba_irrcache.view.document import Document
     from mitsuba_irrcache.view.server import Server
     from mitsuba_irrcache.view.session import Session
