@@ -165,7 +165,12 @@ def main() -> None:
     whole = table(cases)
     print(f"\n{whole.as_text()}\n  {whole.note}\n\n{defaults(cases).as_text()}")
     if args.document:
-        tables = {"error-against-time": whole, "default-settings": defaults(cases)}
+        tables = {
+            "times-of-defaults": table(cases, "defaults"),
+            "default-settings": defaults(cases),
+        }
+        if args.resolutions:
+            tables["error-against-time"] = table(cases, "best")
         replace_tables(args.document, tables)
 
 
@@ -452,13 +457,18 @@ def say(case: Case, text: str) -> None:
     print(f"{case.key}: {text}", flush=True)
 
 
-def table(cases: list[dict]) -> Table:
-    """Tabulate seconds to each error, and speed-ups over the best stock integrator."""
+def table(cases: list[dict], settings: str = "all") -> Table:
+    """Tabulate seconds to each error, and speed-ups over the best stock integrator.
+
+    ``settings``: rows of the "best" ones, of "defaults", or "all".
+    """
     head = ["scene", "depth", "RMSE", "of the volume", "stock", "s", "cold cache", "camera moved"]
     head += ["new process", "setting with a cold cache"]
     cells = []
     for case in cases:
         for row in case["targets"]:
+            if settings not in ("all", "defaults" if row.get("defaults") else "best"):
+                continue
             stages = (row[k] for k in ("cold", "moved", "process"))
             setting = row["cold"]["setting"] if row["cold"] else "—"
             cells.append([
