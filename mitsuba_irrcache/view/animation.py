@@ -101,7 +101,7 @@ def _frames(session: Session, view: View, cameras: Sequence[Camera]) -> Iterator
         for camera in cameras:
 
             def begin(camera: Camera = camera) -> Samples:
-                seen = session.light.seen(look.layered, look.with_error)
+                seen = session.light.snapshot(look.layered, look.with_error)
                 return Samples(seen, camera, view.size, slices=look.slices)
 
             samples = session.call(begin)

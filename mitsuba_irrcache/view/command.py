@@ -97,7 +97,7 @@ def _show(args: argparse.Namespace) -> None:
         try:
             session = _fill(server, args, name)
         except Exception as error:
-            server.tell_failure(original_message(error))
+            server.show_failure(original_message(error))
             raise
         _wait()
     finally:
@@ -108,15 +108,15 @@ def _show(args: argparse.Namespace) -> None:
 
 
 def _fill(server: Server, args: argparse.Namespace, name: str) -> Session:
-    """Load the input while the page tells so, and display it; return the running session."""
+    """Load the input, state progress on the page, display it, and return the running session."""
     from mitsuba_irrcache.view.session import Session
 
-    server.say(f"reading {name} ...")
+    server.show_message(f"reading {name} ...")
     mi.set_variant(args.mode)
     mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
     free_at_once()
     document, appearance = _document(args, server)
-    server.say("computing the illumination ...")
+    server.show_message("computing the illumination ...")
     session = Session(document)
     gc.freeze()  # collections then scan the objects created below only
     session.start()

@@ -15,7 +15,7 @@ from mitsuba_irrcache.io.mitsuba_vol import write_vol
 from mitsuba_irrcache.io.scene_files import filled, scene_of_text, scene_text
 from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
 from mitsuba_irrcache.view.camera import Camera
-from mitsuba_irrcache.view.light import Seeing
+from mitsuba_irrcache.view.light import MarchSettings
 
 #: Prefix of the names that the viewer gives to unnamed objects.
 SUN_ID, MEDIUM_ID = "sun", "medium"
@@ -102,9 +102,9 @@ class Document:
         )
 
     @property
-    def seeing(self) -> Seeing:
+    def march(self) -> MarchSettings:
         """Return the integrator's properties that affect only the ray march."""
-        return Seeing(
+        return MarchSettings(
             self._read("hide_emitters", "false") in _TRUE,
             str(self._read("quadrature", "exponential")),
             float(self._read("step", 1.0)),

@@ -27,12 +27,12 @@ class Editing:
     """Apply changes one after the other in a thread of its own.
 
     While one change is applied, only the newest change of each control stays in the queue. If a
-    change is refused, its control is reset to the previous value, and ``tell`` receives the reason,
-    or "" after a change that succeeds.
+    change is refused, its control is reset to the previous value, and ``report`` receives the
+    reason, or "" after a change that succeeds.
     """
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._report = report
         self._lock = threading.Lock()
         self._waiting: dict[str, Callable[[], None]] = {}
         self._busy = False
@@ -76,9 +76,9 @@ class Editing:
                 change = self._waiting.pop(next(iter(self._waiting)))
             try:
                 change()
-                self._tell("")
+                self._report("")
             except IrrcacheError as error:
-                self._tell(str(error))
+                self._report(str(error))
             except Exception as error:
                 LOG.exception("a change in the viewer failed")
-                self._tell(f"{type(error).__name__}: {error}")
+                self._report(f"{type(error).__name__}: {error}")

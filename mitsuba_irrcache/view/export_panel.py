@@ -16,7 +16,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.animation import MOST_FRAMES, along_path, turntable, write_frames
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.editing import Editing
-from mitsuba_irrcache.view.keep import checked_name, keep, render_command
+from mitsuba_irrcache.view.saving import checked_name, render_command, save_view
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import View
 
@@ -26,7 +26,7 @@ class Cancelled(Exception):  # noqa: N818 (not an error: the user asked for it)
 
 
 class ExportPanel:
-    """Save the view that ``seen`` returns, and animations that begin with it.
+    """Save the view that ``current_view`` returns, and animations that begin with it.
 
     Files are saved in ``folder``, or downloaded by the browser of the ``client`` if it is None.
     """
@@ -37,9 +37,14 @@ class ExportPanel:
         session: Session,
         folder: Path | None,
         editing: Editing,
-        seen: Callable[[], View | None],
+        current_view: Callable[[], View | None],
     ) -> None:
-        self._client, self._session, self._folder, self._seen = client, session, folder, seen
+        self._client, self._session, self._folder, self._current_view = (
+            client,
+            session,
+            folder,
+            current_view,
+        )
         self._gone, self._cancelled = False, threading.Event()
         gui = client.gui
         with gui.add_folder("Save", order=6, expand_by_default=False):
@@ -74,7 +79,7 @@ class ExportPanel:
 
     def _keep(self) -> None:
         name = checked_name(self._name.value)
-        view = self._seen()
+        view = self._current_view()
         if view is None:
             raise IrrcacheError("there is nothing to save before the first image.")
         self._saved.content = "saving ..."
@@ -82,7 +87,7 @@ class ExportPanel:
         try:
             if self._folder is not None:
                 self._folder.mkdir(exist_ok=True)
-                files = keep(self._session, view, self._folder, name, self._cache.value)
+                files = save_view(self._session, view, self._folder, name, self._cache.value)
                 self._saved.content = "saved " + ", ".join(f.name for f in files) + command
             else:
                 self._download(view, name)
@@ -92,7 +97,7 @@ class ExportPanel:
             raise
 
     def _add_knot(self) -> None:
-        view = self._seen()
+        view = self._current_view()
         if view is not None:
             self._path.append(view.camera)
             self._knots.content = f"views of the path: {len(self._path)}"
@@ -102,7 +107,7 @@ class ExportPanel:
         self._knots.content = ""
 
     def _export_turntable(self) -> None:
-        view = self._seen()
+        view = self._current_view()
         if view is not None:
             self._export("turntable", turntable(view.camera, int(self._frames.value)))
 
@@ -112,11 +117,11 @@ class ExportPanel:
     def _export(self, name: str, cameras: list[Camera]) -> None:
         """Write the frames of an animation to the folder, or let the browser download them."""
         name = f"{checked_name(self._name.value)}-{name}"
-        view = self._seen()
+        view = self._current_view()
         if view is None:
             return
 
-        def tell(done: int) -> None:
+        def report_progress(done: int) -> None:
             self._exported.content = f"frame {done} of {len(cameras)} ..."
             if self._gone:
                 raise IrrcacheError("the window was closed during an export.")
@@ -126,7 +131,7 @@ class ExportPanel:
         self._cancelled.clear()
         self._cancel.visible = True
         try:
-            self._write(name, view, cameras, tell)
+            self._write(name, view, cameras, report_progress)
         except Cancelled:
             written = "" if self._folder is None else f"; its frames are in {name}"
             self._exported.content = f"the export was cancelled{written}"
@@ -137,22 +142,24 @@ class ExportPanel:
             self._cancel.visible = False
 
     def _write(
-        self, name: str, view: View, cameras: list[Camera], tell: Callable[[int], None]
+        self, name: str, view: View, cameras: list[Camera], report_progress: Callable[[int], None]
     ) -> None:
-        tell(0)
+        report_progress(0)
         rate = float(self._rate.value)
         if self._folder is not None:
-            files = write_frames(self._session, view, cameras, self._folder / name, rate, tell)
+            files = write_frames(
+                self._session, view, cameras, self._folder / name, rate, report_progress
+            )
             self._exported.content = f"saved {len(files)} files in {name}"
             return
         with tempfile.TemporaryDirectory() as folder:
-            files = write_frames(self._session, view, cameras, Path(folder), rate, tell)
+            files = write_frames(self._session, view, cameras, Path(folder), rate, report_progress)
             self._offer(name, files)
         self._exported.content = f"downloaded {name}.zip"
 
     def _download(self, view: View, name: str) -> None:
         with tempfile.TemporaryDirectory() as folder:
-            files = keep(self._session, view, Path(folder), name, self._cache.value)
+            files = save_view(self._session, view, Path(folder), name, self._cache.value)
             self._offer(name, files)
 
     def _offer(self, name: str, files: list[Path]) -> None:

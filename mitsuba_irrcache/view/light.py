@@ -27,7 +27,7 @@ EMISSIVE_DIRECTIONS = 8
 
 
 @dataclass(frozen=True)
-class Seeing:
+class MarchSettings:
     """Ray-marching settings, named as the plugin's properties."""
 
     hide_emitters: bool = False
@@ -35,7 +35,7 @@ class Seeing:
     step: float = 1.0
 
 
-class Seen:
+class CacheSnapshot:
     """An immutable copy of the caches for camera rays, unaffected by further refinement."""
 
     def __init__(
@@ -76,10 +76,10 @@ class Light:
         self,
         scene: mi.Scene,
         settings: CacheSettings,
-        seeing: Seeing,
+        march: MarchSettings,
         pause: Callable[[], None] | None = None,
     ) -> None:
-        self.scene, self.settings, self.seeing = scene, settings, seeing
+        self.scene, self.settings, self.march = scene, settings, march
         emission, factor = scene.integrator().emission
         samples = DIRECTIONS if emission is None else EMISSIVE_DIRECTIONS
         settings = replace(settings, samples=samples, with_error=False)
@@ -93,7 +93,7 @@ class Light:
         self.seconds = 0.0
         #: whether the last refinement raised an exception
         self.failed = False
-        self._seen: dict[tuple[bool, bool], tuple[int, Seen]] = {}
+        self._seen: dict[tuple[bool, bool], tuple[int, CacheSnapshot]] = {}
 
     @property
     def parts(self) -> list[CachedMedium]:
@@ -184,17 +184,17 @@ class Light:
         coarse.refine(self.scene, coarse.cache.batch, False, None)
         return coarse
 
-    def seen(self, layered: bool, with_error: bool) -> Seen:
+    def snapshot(self, layered: bool, with_error: bool) -> CacheSnapshot:
         """Return a copy of the current caches; `camera_rays_of` computes the requested layers."""
         key = layered, with_error
         known = self._seen.get(key)
         if known is None or known[0] != self.revision:
             parts = self.parts if self._coarse is None else [self._coarse]
-            s = self.seeing
+            s = self.march
             camera_rays = camera_rays_of(
                 parts, self.settings, s.hide_emitters, s.quadrature, s.step, layered, with_error
             )
-            known = self.revision, Seen(self.scene, parts, camera_rays, layered)
+            known = self.revision, CacheSnapshot(self.scene, parts, camera_rays, layered)
             # Release the fields of the previous caches: they are as large as the cache itself.
             self._seen = {k: v for k, v in self._seen.items() if v[0] == self.revision}
             self._seen[key] = known

@@ -40,7 +40,7 @@ class LightPanel:
             if document.has_environment_map:
                 self._light("rotation", lighting.rotation, -180.0, 180.0, gui, slider=True)
             hidden = gui.add_checkbox(
-                "hide emitters", document.seeing.hide_emitters,
+                "hide emitters", document.march.hide_emitters,
                 hint='they light the medium, but are not seen: "background" is',
             )  # fmt: skip
             self.editing.bind(

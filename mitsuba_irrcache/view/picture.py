@@ -16,7 +16,7 @@ from mitsuba_irrcache.render.denoise import filter_illumination
 from mitsuba_irrcache.render.film import PixelPositions
 from mitsuba_irrcache.render.pixel_filter import pixel_of
 from mitsuba_irrcache.view.camera import Camera
-from mitsuba_irrcache.view.light import Seen
+from mitsuba_irrcache.view.light import CacheSnapshot
 from mitsuba_irrcache.view.slices import SlicedCameraRays, Slices
 
 #: The kind of image in which pixels with too large an error bar are marked, the colour of the
@@ -80,7 +80,7 @@ class Samples:
 
     def __init__(
         self,
-        seen: Seen,
+        seen: CacheSnapshot,
         camera: Camera,
         size: tuple[int, int],
         seed: int = 0,

@@ -45,7 +45,7 @@ class ViewReference:
                 "type": "volpath",
                 "max_depth": settings.max_depth,
                 "rr_depth": settings.rr_depth,
-                "hide_emitters": light.seeing.hide_emitters,
+                "hide_emitters": light.march.hide_emitters,
             }
         )
         self._inside = medium_at(light.scene, np.array(camera.position))[0]
@@ -121,13 +121,13 @@ class ViewReference:
         if not self.samples:
             return f"volpath, first sample: {self.progress:.0%} of the image"
         samples = "1 sample" if self.samples == 1 else f"{self.samples} samples"
-        told = f"volpath, {samples} per pixel"
+        text = f"volpath, {samples} per pixel"
         if self.coarseness > 1:
-            told += f" of {self.coarseness} x {self.coarseness}"
+            text += f" of {self.coarseness} x {self.coarseness}"
         found = self.error_of(image)
         if found is None:
-            return told
-        return f"{told}; RMSE {between(*found)} of the mean, its noise taken out"
+            return text
+        return f"{text}; RMSE {between(*found)} of the mean, its noise taken out"
 
     def signed_error(self, image: np.ndarray) -> np.ndarray:
         """Return the error of ``image``, mean over the channels, in units of the mean radiance.

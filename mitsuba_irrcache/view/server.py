@@ -39,8 +39,8 @@ FAREWELL_SECONDS = 0.5
 class Server:
     """Serve the page on ``host`` and ``port``, or on the next free port.
 
-    The page tells what it waits for (`say`) until `show` gives it something to display. Files that
-    visitors save go to ``folder``, or to their browsers if it is None.
+    The page displays the text of `show_message` until `show` gives it something to display. Files
+    that visitors save go to ``folder``, or to their browsers if it is None.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Server:
         ):
             self._server = viser.ViserServer(host, port, label="irrcache", verbose=False)
         self.port = self._server.get_port()
-        self._keep_to_ourselves()
+        self._refuse_other_hosts()
         server = self._server
         server.gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False, control_width="medium"
@@ -83,13 +83,13 @@ class Server:
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
 
-    def say(self, text: str) -> None:
+    def show_message(self, text: str) -> None:
         """Display what the page waits for in all windows without an image."""
         self.channel.send("wait", text)
 
-    def tell_failure(self, text: str) -> None:
+    def show_failure(self, text: str) -> None:
         """Display why nothing will be displayed, before the server stops."""
-        self.say(f"error: {text}")
+        self.show_message(f"error: {text}")
         if self.channel.has_windows:
             time.sleep(FAREWELL_SECONDS)
 
@@ -108,7 +108,7 @@ class Server:
         """Display a started ``session`` in all windows, also in those that are open already."""
         self.session = session
         self.send_preview(session)
-        self.say("loading the controls ...")
+        self.show_message("loading the controls ...")
         self._set_first_camera(session)
         self._placeholder.remove()
         self.panel = LightPanel(self._server, session, self.channel)
@@ -180,7 +180,7 @@ class Server:
         if visitor is not None:
             visitor.close()
 
-    def _keep_to_ourselves(self) -> None:
+    def _refuse_other_hosts(self) -> None:
         """Disable what viser offers to other hosts.
 
         These are tunnels to its relay, which any window could request, and windows of pages of

@@ -23,7 +23,7 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
-from mitsuba_irrcache.view.light import Light, Seen, Status
+from mitsuba_irrcache.view.light import CacheSnapshot, Light, Status
 from mitsuba_irrcache.view.picture import Look, Samples, exposure_of
 from mitsuba_irrcache.view.slices import Slices
 from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
@@ -176,13 +176,13 @@ class Session:
     def _look_first(self) -> None:
         """Render an image by the first camera with one sample per pixel, and choose an exposure."""
         camera = next(iter(self.cameras.values()))
-        samples = Samples(self._shown.seen(layered=False, with_error=False), camera, FIRST_LOOK)
+        samples = Samples(self._shown.snapshot(layered=False, with_error=False), camera, FIRST_LOOK)
         samples.add(1)
         if self._shown.is_emissive:  # of any radiance, in contrast to what usual emitters light
             self.exposure = exposure_of(samples.image())
         self.first_look = samples.picture(Look(exposure=self.exposure), self.extent(camera))
 
-    def complete(self, seen: Seen, view: View) -> Samples | None:
+    def complete(self, seen: CacheSnapshot, view: View) -> Samples | None:
         """Return all samples of ``view`` if a window has them; for the session's thread only."""
         return next((w.samples for w in self._windows if w.is_complete(seen, view)), None)
 
@@ -220,7 +220,7 @@ class Session:
             self._light = None
         for window in self._windows:
             window.forget()
-        self._say(message=original_message(error))
+        self._publish_status(message=original_message(error))
 
     def _begin(self) -> None:
         scene = self.document.scene()
@@ -236,7 +236,7 @@ class Session:
 
     def _light_of(self, scene: mi.Scene) -> Light:
         document = self.document
-        return Light(scene, document.settings, document.seeing, self._pause)
+        return Light(scene, document.settings, document.march, self._pause)
 
     def _edit(self, change: Callable[[Document], None]) -> None:
         before = self.document.state()
@@ -320,19 +320,19 @@ class Session:
             self._revision += 1
             self._shown, self._shown_samples = light, light.samples
             if other:
-                self._let_go()
+                self._release_previous()
         elif not self._wants_light:
             self._revision += 1
-        self._say()
+        self._publish_status()
 
-    def _let_go(self) -> None:
+    def _release_previous(self) -> None:
         """Release the previous caches, whose arrays are as large as the displayed ones."""
         for window in list(self._windows):
-            window.let_go(self._shown)
+            window.release_others(self._shown)
         gc.collect()  # media with surfaces are part of reference cycles
         dr.flush_malloc_cache()
 
-    def _say(self, message: str = "") -> None:
+    def _publish_status(self, message: str = "") -> None:
         self.status = Status.of(self._light or self._shown, self._wants_light, message)
         self.on_status(self.status)
 

@@ -56,9 +56,9 @@ class TransferPanel:
         channel.receive("load", self._load)
         channel.receive("undo", lambda _: self._travel(-1))
         channel.receive("redo", lambda _: self._travel(1))
-        self._tell()
+        self._send_state()
 
-    def _tell(self) -> None:
+    def _send_state(self) -> None:
         """Send the function to the editors of all windows."""
         mapping, appearance = self._appearance.mapping, self._appearance
         colours = zip(mapping.colour_values.tolist(), mapping.colours.tolist(), strict=True)
@@ -98,7 +98,7 @@ class TransferPanel:
             function, preset = self._history.at(steps)
             self._apply(function, preset, done=False)
             self._history.travel(steps)
-            self._tell()
+            self._send_state()
 
         self._editing.submit("travel", change)
 
@@ -127,7 +127,7 @@ class TransferPanel:
             if done:
                 self._history.add(function, preset)
         finally:
-            self._tell()
+            self._send_state()
 
 
 class History:

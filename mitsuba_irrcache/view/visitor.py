@@ -28,8 +28,8 @@ from mitsuba_irrcache.view.window import Picture, View
 
 #: JPEG quality for moving cameras and for images that better ones will replace.
 MOVING_QUALITY, RESTING_QUALITY = 80, 95
-#: How often the first camera is placed again in a page that is still loading. It tells its own one
-#: at each step of its layout.
+#: How often the first camera is placed again in a page that is still loading. It sends its own
+#: camera at each step of its layout.
 ATTEMPTS = 40
 #: Largest side of a window in pixels.
 LARGEST_SIDE = 1 << 15
@@ -189,7 +189,7 @@ class Visitor:
     # ------------------------------------------------------------------ to and from the session
 
     async def _camera_moved(self, camera: viser.CameraHandle) -> None:
-        if self._attempts:  # the page has not told yet that its camera is where it was placed
+        if self._attempts:  # the page has not confirmed yet where its camera is
             places = (camera.position, self._placed), (camera.look_at, self._aimed)
             if not all(np.allclose(*pair, atol=1e-3) for pair in places):
                 self._attempts -= 1
@@ -248,9 +248,9 @@ class Visitor:
         self._channel.send("picture", _encoded(picture), self._key)
         if not picture.moving or monotonic() - self._noted > NOTE_SECONDS:
             self._noted = monotonic()
-            self._tell(picture)
+            self._send_note(picture)
 
-    def _tell(self, picture: Picture) -> None:
+    def _send_note(self, picture: Picture) -> None:
         """Send what lies over the image: a note about it, and the comparison."""
         height, width, _ = picture.pixels.shape
         state = "moving" if picture.moving else "final" if picture.final else "at rest"

@@ -10,7 +10,7 @@ import numpy as np
 
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.comparison import Compared, Comparison
-from mitsuba_irrcache.view.light import Light, Seen
+from mitsuba_irrcache.view.light import CacheSnapshot, Light
 from mitsuba_irrcache.view.picture import Look, Samples
 
 #: Seconds without a movement after which a camera counts as resting.
@@ -114,7 +114,7 @@ class Window:
         self.samples = self._light = self._comparison = None
         self.outdated = False
 
-    def let_go(self, light: Light) -> None:
+    def release_others(self, light: Light) -> None:
         """Release images of caches other than ``light``."""
         if self._light is not light:
             self.outdated = self.view is not None
@@ -137,8 +137,8 @@ class Window:
         """
         return self.outdated or (self.fresh and self.is_moving)
 
-    def is_complete(self, seen: Seen, view: View) -> bool:
-        """Return whether all samples of an image at rest of ``view`` from ``seen`` are there."""
+    def is_complete(self, seen: CacheSnapshot, view: View) -> bool:
+        """Return whether all samples of an image at rest of ``view`` of these caches exist."""
         had = self.samples
         return (
             had is not None
@@ -152,7 +152,7 @@ class Window:
         share, stride = LEVELS[self.level]
         size = tuple(max(round(n * share), 1) for n in view.size)
         started, look = perf_counter(), replace(view.look, filtered=False)  # no time for that
-        seen = light.seen(look.layered, look.with_error)
+        seen = light.snapshot(look.layered, look.with_error)
         seen.stride(stride)
         try:
             samples = Samples(seen, view.camera, size, slices=look.slices)
@@ -179,7 +179,7 @@ class Window:
         still refined. If ``pause`` raises an exception, the window's state is unchanged.
         """
         look = view.look
-        seen = light.seen(look.layered, look.with_error)
+        seen = light.snapshot(look.layered, look.with_error)
         samples = self.samples
         known = samples is not None and self._revision == revision
         known = known and (samples.seen, samples.slices) == (seen, look.slices)

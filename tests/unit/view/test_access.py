@@ -35,7 +35,7 @@ CAMERA = Camera((0.0, -5.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
 def served(request):
     """Return the access control of a server that displays nothing yet, and its port."""
     server = Server(request.param, 8750)
-    server.say("reading ...")
+    server.show_message("reading ...")
     yield server._access, server.port
     server.stop()
 

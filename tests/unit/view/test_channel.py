@@ -38,7 +38,7 @@ def test_windows_receive_the_newest_messages_to_them(server):
     """A window receives the newest messages to all, then its own, and none of other windows."""
     channel = server.channel
     for text in ("first", "second"):
-        server.say(text)
+        server.show_message(text)
     own, other = channel.open(), channel.open()
     channel.send("note", "for another", other)
     channel.send("note", "yours", own)
@@ -55,12 +55,12 @@ def test_windows_receive_the_newest_messages_to_them(server):
 
 def test_windows_are_told_why_there_is_nothing(server):
     """Windows that wait for a volume learn why it cannot be read."""
-    server.say("reading ...")
+    server.show_message("reading ...")
     with open_channel(server) as connection:
         assert received(connection)["value"] == "reading ..."
-        server.tell_failure("no such file")
+        server.show_failure("no such file")
         assert received(connection) == {"kind": "wait", "value": "error: no such file"}
-    server.say("")
+    server.show_message("")
 
 
 def test_messages_of_windows(server):

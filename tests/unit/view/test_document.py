@@ -177,9 +177,9 @@ def test_saved_scenes_load_from_another_folder(path, tmp_path_factory):
 def test_emitters_are_hidden_and_shown(path):
     """The environment lights the medium all the same, and a saved scene says so."""
     document = Document.load(path, {}, "irrcache")
-    assert not document.seeing.hide_emitters
+    assert not document.march.hide_emitters
     document.set_hide_emitters(True)
-    assert document.seeing.hide_emitters
+    assert document.march.hide_emitters
     assert "hide_emitters = true" in str(document.scene().integrator())
     document.set_hide_emitters(False)
-    assert not document.seeing.hide_emitters
+    assert not document.march.hide_emitters

@@ -48,7 +48,7 @@ def front_camera() -> Camera:
 
 
 def reference_of(document: Document, camera: Camera, samples: int) -> ViewReference:
-    light = Light(document.scene(), document.settings, document.seeing)
+    light = Light(document.scene(), document.settings, document.march)
     found = ViewReference(light, camera, SIZE)
     while found.samples < samples:
         found.refine()
@@ -95,7 +95,7 @@ def test_reported_error_excludes_the_reference_noise(document):
     """
     camera = front_camera()
     exact = reference_of(document, camera, 96).radiance()
-    few = ViewReference(Light(document.scene(), document.settings, document.seeing), camera, SIZE)
+    few = ViewReference(Light(document.scene(), document.settings, document.march), camera, SIZE)
     assert few.error_of(exact) is None
     while few.samples < 2:
         few.refine()
@@ -113,7 +113,7 @@ def test_noise_is_not_reported_as_an_error(document, true):
     They are two standard errors wide: one trial in forty may exceed each of them.
     """
     camera, rng = front_camera(), np.random.default_rng(1)
-    few = ViewReference(Light(document.scene(), document.settings, document.seeing), camera, SIZE)
+    few = ViewReference(Light(document.scene(), document.settings, document.march), camera, SIZE)
     few._passes, few._counts[:] = 2, 1
     image = np.ones((*few.size[::-1], 3)) + true * rng.choice([-1, 1], (*few.size[::-1], 1))
     found = []
@@ -182,7 +182,7 @@ def test_reference_is_displayed_until_something_changes(document, monkeypatch):
 def test_coarse_references_are_means_over_pixels(document):
     """A coarse reference is the finer one, averaged over the pixels that it covers."""
     camera = front_camera()
-    light = Light(document.scene(), document.settings, document.seeing)
+    light = Light(document.scene(), document.settings, document.march)
     fine, coarse = ViewReference(light, camera, SIZE), ViewReference(light, camera, SIZE, 3)
     for reference, samples in ((fine, 24), (coarse, 96)):
         while reference.samples < samples:

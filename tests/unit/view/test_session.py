@@ -16,15 +16,14 @@ import pytest
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.images import read_image
-from mitsuba_irrcache.view import keep as keeping
-from mitsuba_irrcache.view import picture
+from mitsuba_irrcache.view import picture, saving
 from mitsuba_irrcache.view import session as sessions
 from mitsuba_irrcache.view import window as windows
 from mitsuba_irrcache.view.appearance import Appearance
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document
-from mitsuba_irrcache.view.keep import keep, render_command
 from mitsuba_irrcache.view.picture import KINDS, Look, Samples
+from mitsuba_irrcache.view.saving import render_command, save_view
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
 from mitsuba_irrcache.volumes.colours import Colours
@@ -72,7 +71,7 @@ def test_a_window_at_rest_gets_the_image_that_render_gives(session, tmp_path, ba
     view = View(turned(front(session), 40), SIZE, look)
     session.look(window, view)
     shown = screen.wait(final).pixels
-    files = keep(session, view, tmp_path, "kept", with_cache=True)
+    files = save_view(session, view, tmp_path, "kept", with_cache=True)
     assert {f.name for f in files} == {"kept.exr", "kept.png", "kept-scene.xml", "kept.cache"}
     np.testing.assert_array_equal(np.rint(255 * read_image(tmp_path / "kept.png")), shown)
     _, *words = shlex.split(render_command("kept", look))
@@ -97,7 +96,7 @@ def test_a_view_that_is_saved_during_an_edit_shows_the_edit(session, tmp_path, m
     view = View(front(session), SIZE)
     session.look(window, view)
     before = screen.wait(final).pixels
-    sampled, edits = keeping._samples, [4.0]
+    sampled, edits = saving._samples, [4.0]
 
     def and_edited(*arguments, **options) -> Samples:
         found = sampled(*arguments, **options)
@@ -105,8 +104,8 @@ def test_a_view_that_is_saved_during_an_edit_shows_the_edit(session, tmp_path, m
             session.edit(lambda document: document.set_density(edits.pop()))
         return found
 
-    monkeypatch.setattr(keeping, "_samples", and_edited)
-    keep(session, view, tmp_path, "kept", with_cache=True)
+    monkeypatch.setattr(saving, "_samples", and_edited)
+    save_view(session, view, tmp_path, "kept", with_cache=True)
     assert session.document.density == 4 and not session.has_edit
     shown = np.rint(255 * read_image(tmp_path / "kept.png"))
     assert main(["render", str(tmp_path / "kept-scene.xml")]) == 0
@@ -191,7 +190,7 @@ def test_no_kernel_is_compiled_for_another_camera_or_size(session, kernels):
     screen.wait(final)
 
     def pictures(size, degrees):
-        seen = session.light.seen(False, False)
+        seen = session.light.snapshot(False, False)
         samples = Samples(seen, turned(front(session), degrees), size)
         samples.add(1)
         samples.picture(Look(exposure=degrees), (0, 1))
@@ -330,7 +329,7 @@ def test_all_kinds_of_images(session):
 @pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "", "a" * 100, "/etc/passwd", "a\n"])
 def test_file_names_outside_the_folder_are_refused(session, tmp_path, name):
     with pytest.raises(IrrcacheError, match="no name"):
-        keep(session, View(front(session), SIZE), tmp_path, name)
+        save_view(session, View(front(session), SIZE), tmp_path, name)
 
 
 def test_unsupported_scenes_raise_errors(path, tmp_path):

@@ -59,7 +59,7 @@ def test_slices_are_seen_through_the_medium_in_front():
         look = Look(exposure=2.0, background=(0.0, 0.0, 1.0))
 
         def samples(slices: Slices | None) -> Samples:
-            found = Samples(session.light.seen(True, False), camera, (32, 32), slices=slices)
+            found = Samples(session.light.snapshot(True, False), camera, (32, 32), slices=slices)
             found.add(1)
             return found
 

@@ -33,7 +33,7 @@ def checked_name(name: str) -> str:
     return name
 
 
-def keep(
+def save_view(
     session: Session, view: View, folder: Path, name: str, with_cache: bool = False
 ) -> list[Path]:
     """Write ``name``.png (the displayed image), .exr (radiance and layers) and ``name``-scene.xml.
@@ -100,7 +100,7 @@ def _samples(session: Session, view: View, layered: bool) -> Samples:
     """
 
     def begin() -> Samples:
-        seen, slices = session.light.seen(layered, layered), view.look.slices
+        seen, slices = session.light.snapshot(layered, layered), view.look.slices
         known = session.complete(seen, view)
         return known or Samples(seen, view.camera, view.size, slices=slices)
 
