@@ -1,6 +1,8 @@
 """Resident memory of a long fit: 16^3 voxels, two views of 32 x 32 pixels, by Adam.
 
     python -m experiments.validation.gradients.memory [--steps 500]
+
+The fit starts from an even extinction under a sun.
 """
 
 from __future__ import annotations
