@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 SIDE = 5.0  #: half an edge of the medium
-PIXELS = 32
+PIXELS = 32  #: of an image, per side
 
 #: (z, y, x) voxels; None: a homogeneous medium
 GRIDS = (
@@ -177,13 +177,13 @@ class RandomScene:
         """Return the properties of the integrator that affect the image."""
         return {"max_depth": self.max_depth, "hide_emitters": self.hide_emitters}
 
-    def build(self, integrator: dict, folder: Path) -> dict:
+    def build(self, integrator: dict, folder: Path, pixels: int = PIXELS) -> dict:
         """Return the dictionary for `mi.load_dict`; meshes are written to ``folder``."""
         folder.mkdir(parents=True, exist_ok=True)
         parts = {"type": "scene", "integrator": integrator, "medium": self._medium()}
         inside = {"type": "ref", "id": "medium"}
         parts["boundary"] = self._boundary(folder) | {"bsdf": {"type": "null"}, "interior": inside}
-        parts |= self._emitters(folder) | self._surroundings() | {"sensor": self._sensor()}
+        parts |= self._emitters(folder) | self._surroundings() | {"sensor": self._sensor(pixels)}
         return parts
 
     # -- media -------------------------------------------------------------------------------------
@@ -407,10 +407,10 @@ class RandomScene:
             fov = 58.0  # so that they are visible
         return origin, target, fov
 
-    def _sensor(self) -> dict:
+    def _sensor(self, pixels: int) -> dict:
         origin, target, fov = self._view()
         film = {
-            "type": "hdrfilm", "width": PIXELS, "height": PIXELS, "component_format": "float32",
+            "type": "hdrfilm", "width": pixels, "height": pixels, "component_format": "float32",
             "rfilter": {"type": "box"},
         }  # fmt: skip
         sensor = {

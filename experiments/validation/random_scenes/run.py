@@ -1,42 +1,38 @@
 """Random scenes against volpath, at default settings.
 
-    python -m experiments.validation.random_scenes.run [--count 60] [--seed 1] [--only K ...]
-        [--seconds 12]
-        [--budget 480] [--force] [--document FILE]
+    python -m experiments.validation.random_scenes.run [--count 20] [--seeds 301 302 303]
+        [--only K ...] [--seconds 60] [--budget 480] [--force] [--document FILE]
 
 Each scene (see generate.py) is loaded by `mi.load_dict`, with the integrator ``irrcache`` at
 default settings except ``max_depth`` and ``hide_emitters``, and rendered with two values of
-``cache_seed``, which separates the noise of the cache from its bias. The reference is rendered by
-volpath (volpathmis if it is cheaper) in two independent halves. A pilot run selects the samples for
-a noise of 4 % of the mean radiance per pixel in each half, with which that of the mean is much less
-than a third of a percent, within about ``--seconds`` for the whole reference. A scene whose mean is
-not known to a third of a percent then counts as undecided; the table marks scenes for which only
+``cache_seed``, which separates the noise of the cache from its bias; with up to six where two do
+not determine the mean. The reference (see references.py) is rendered by volpath (volpathmis if it
+is cheaper) in independent batches until the standard error of the mean radiance is a quarter of a
+percent, for at most ``--seconds`` of processor time. A scene whose difference of means has a
+standard error above a third of a percent counts as undecided; the table marks scenes for which only
 the mean of the volume alone is uncertain.
 
 The table has the difference of the means; the RMSE, net of the reference's noise, by
 mean((x - a)(x - b)); its bias, by mean((x - a)(y - b)), with a lower bound of three standard
-errors; the largest error of a block of 4 x 4 pixels. All in % of the mean radiance of the image
+errors; the largest error of a block of 6 x 6 pixels. All in % of the mean radiance of the image
 and, in brackets, of that of the volume alone: of the image without the
 unscattered radiance (volpath at depth 1). A scene *disagrees* if one of these, in both
-renderings, is beyond three standard errors (4.5 for the worst of 64 blocks) and beyond LIMITS.
+renderings, is beyond three standard errors (4.5 for the worst block) and beyond LIMITS.
 
 Rows are stored in output/random_scenes/<seed>.json, images and references as .npz files;
 ``--force`` discards the rows and renders with irrcache again, against the stored references.
-``--document`` writes the counts, and the scenes that do not agree, to a Markdown file. No
-scene is started after ``--budget`` seconds: run it again for the others, and with more
-``--seconds`` for those that are undecided.
+``--document`` writes the table to a Markdown file. No scene is started after ``--budget`` seconds:
+run it again for the others, and with more ``--seconds`` for those that are undecided, whose
+references are refined.
 """
 
 from __future__ import annotations
 
-import gc
 import json
 import time
 from functools import partial
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 import mitsuba_irrcache  # noqa: F401 (registers the plugin)
@@ -44,17 +40,16 @@ from experiments.support.documents import replace_tables
 from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
 from experiments.validation.random_scenes.generate import RandomScene
-from mitsuba_irrcache.compare.metrics import block_means, colours, net_rmse
+from experiments.validation.random_scenes.references import MEAN_NOISE, load, picture, reference
+from mitsuba_irrcache.compare.metrics import block_means, net_rmse
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import IrrcacheError, origin, original_message
 
-#: Samples per pixel of an image by irrcache, of the pilot's images, and their number.
-SPP, PILOT_SPP, PILOTS = 128, 16, 4
-#: Most samples per pixel of one image of the reference: bounds memory.
-LARGEST_SPP = 1024
-BLOCK = 4
-#: Noise of a pixel of half a reference, and of the mean radiance, in units of the mean.
-PIXEL_NOISE, MEAN_NOISE = 0.04, 0.01 / 3
+#: Samples per pixel of an image by irrcache.
+SPP = 256
+BLOCK = 6
+#: Most caches for the mean of a scene, and the standard error that two suffice for.
+CACHES, OWN_NOISE = 6, 0.002
 #: Thresholds of errors in units of the mean, and in standard errors.
 LIMITS = {"mean": 0.01, "bias": 0.01, "block": 0.03}
 SIGMAS = {"mean": 3.0, "bias": 3.0, "block": 4.5}
@@ -66,37 +61,51 @@ def compute(case: RandomScene, seconds: float, folder: Path) -> dict:
     ours = ours_of(case, folder)
     if "failed" in ours:
         return row | ours
-    reference = stored_reference(case, seconds, folder)
-    images = {name: reference.pop(name) for name in ("a", "b", "unscattered")}
+    known = reference(case, seconds, folder)
+    a, b = known.halves()
+    images = {"a": a, "b": b, "unscattered": known.unscattered}
     images |= {name: ours.pop(name) for name in ("x", "y")}
     np.savez_compressed(folder / f"{case.seed}-{case.index}.npz", **images)
-    return row | ours | reference | compare(**images)
+    judged = {"judge": known.judge, "rr_depth": known.rr_depth, "judge_seconds": known.seconds}
+    row |= ours | judged | {"spp": known.spp * len(known.means)} | compare(**images)
+    if "x" in row:
+        row["noise"] = known.noise
+        row |= mean_over_caches(case, folder, row, float(0.5 * (a + b).mean()))
+    return row
 
 
-def load(case: RandomScene, integrator: str, folder: Path, **settings) -> mi.Scene:
-    """Load the scene with a cold cache."""
-    gc.collect()
-    plugin = {"type": integrator} | case.properties | settings
-    return mi.load_dict(case.build(plugin, folder))
+def mean_over_caches(case: RandomScene, folder: Path, row: dict, mean: float) -> dict:
+    """Return the error of the mean image with several caches, and its standard error.
 
+    Two caches suffice unless they differ or disagree with the reference.
+    """
+    errors = [row["x"]["mean"], row["y"]["mean"]]
 
-def picture(scene: mi.Scene, spp: int, seed: int) -> np.ndarray:
-    """Render colours, float64."""
-    return colours(np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float64))
+    def noise() -> float:
+        return float(np.std(errors, ddof=1) / len(errors) ** 0.5)
+
+    def is_clear() -> bool:
+        return noise() <= OWN_NOISE and abs(np.mean(errors)) <= LIMITS["mean"]
+
+    while len(errors) < CACHES and not is_clear():
+        seed = len(errors)
+        image = picture(load(case, "irrcache", folder, cache_seed=seed), SPP, seed)
+        errors.append(float(image.mean() / mean - 1))
+    return {"error": float(np.mean(errors)), "own_noise": noise(), "caches": len(errors)}
 
 
 def ours_of(case: RandomScene, folder: Path) -> dict:
-    """Return images with two seeds, the solver, and the seconds of the first image.
+    """Return images with two seeds, the solver, and the CPU seconds of the first image.
 
     If there are none, ``refused`` says whether irrcache refused the scene with a message.
     """
     found: dict = {}
     try:
         for name, seed in (("x", 0), ("y", 1)):
-            started = time.perf_counter()
+            started = time.process_time()
             scene = load(case, "irrcache", folder, **({"cache_seed": seed} if seed else {}))
             found[name] = picture(scene, SPP, seed)
-            found.setdefault("seconds", time.perf_counter() - started)
+            found.setdefault("seconds", time.process_time() - started)
     except Exception as error:  # any exception that a user would see
         refused = isinstance(origin(error), IrrcacheError)
         return {
@@ -107,49 +116,6 @@ def ours_of(case: RandomScene, folder: Path) -> dict:
     builder = scene.integrator()._builder
     solved = any(part.cache is not None for part in builder.parts)
     return found | {"solver": builder.solver if solved else "none"}
-
-
-def reference_of(case: RandomScene, seconds: float, folder: Path) -> dict:
-    """Render two halves with the cheaper stock integrator, and their unscattered part."""
-    candidates = ("volpath", "volpathmis") if case.is_chromatic else ("volpath",)
-    pilots = {name: pilot(load(case, name, folder, rr_depth=50)) for name in candidates}
-    judge = min(pilots, key=lambda name: pilots[name][0] * pilots[name][1])
-    variance, each, mean = pilots[judge]
-    wanted = variance / max(PIXEL_NOISE * mean, 1e-12) ** 2  # samples of a half
-    affordable = seconds / 2 / each
-    samples = float(np.clip(min(wanted, affordable), PILOT_SPP, 2**20))
-    count = int(np.ceil(samples / LARGEST_SPP))
-    spp = int(np.ceil(samples / count))
-    scene = load(case, judge, folder, rr_depth=50)
-    a, b = (
-        np.mean([picture(scene, spp, 1000 + 2 * i + half) for i in range(count)], axis=0)
-        for half in range(2)
-    )
-    unscattered = picture(load(case, judge, folder, max_depth=1), 256, 7)
-    return {"a": a, "b": b, "unscattered": unscattered, "judge": judge, "spp": 2 * spp * count}
-
-
-def stored_reference(case: RandomScene, seconds: float, folder: Path) -> dict:
-    """Return `reference_of`, from its file if that is of the same scene and ``seconds``."""
-    file, drawn = folder / f"{case.seed}-{case.index}-reference.npz", json.dumps(case.as_dict())
-    if file.exists():
-        with np.load(file) as stored:
-            if str(stored["drawn"]) == drawn and stored["seconds"] >= seconds:
-                found = {name: stored[name] for name in ("a", "b", "unscattered")}
-                return found | {"judge": str(stored["judge"]), "spp": int(stored["spp"])}
-    found = reference_of(case, seconds, folder)
-    np.savez_compressed(file, drawn=drawn, seconds=seconds, **found)
-    return found
-
-
-def pilot(scene: mi.Scene) -> tuple[float, float, float]:
-    """Return the variance of a sample, averaged over pixels, its seconds, and the mean radiance."""
-    picture(scene, 1, 0)  # compiles kernels
-    dr.sync_thread()
-    started = time.perf_counter()
-    images = [picture(scene, PILOT_SPP, seed) for seed in range(1, 1 + PILOTS)]
-    each = (time.perf_counter() - started) / (PILOTS * PILOT_SPP)
-    return float(np.var(images, axis=0, ddof=1).mean()) * PILOT_SPP, each, float(np.mean(images))
 
 
 def compare(a, b, unscattered, x, y) -> dict:
@@ -167,8 +133,10 @@ def compare(a, b, unscattered, x, y) -> dict:
     grey = 0.25 * ((a - b).mean(axis=-1) ** 2)  # variance of the reference's grey pixels
     own = 0.5 * (x - y).mean(axis=-1) ** 2  # likewise of an image of ours, camera and cache
     found["noise"] = float(np.sqrt(grey.mean() / grey.size) / mean)
-    # One sample of the difference of two means, each with noise of its own.
-    found["own_noise"] = float(abs(x.mean() - y.mean()) / 2**0.5 / mean)
+    # Of the mean of both images: of all pixels (cache), and of each (camera).
+    common, each = abs((x - y).mean()) / 2, np.sqrt(own.mean() / own.size / 2)
+    found["own_noise"] = float(max(common, each) / mean)
+    found["error"] = float((0.5 * (x + y) - r).mean() / mean)
     blocks, block_noise = (
         [],
         np.sqrt((block_means((grey + own)[..., None], BLOCK)[..., 0]) / BLOCK**2),
@@ -220,8 +188,7 @@ def verdict(row: dict) -> str:
     for suffix, unit in (("", 1.0), (" of volume", volume)):
         if suffix and not 0.01 < unit < 0.95:
             continue
-        mean = min((row[k]["mean"] for k in "xy"), key=abs)
-        if abs(mean) > max(LIMITS["mean"] * unit, SIGMAS["mean"] * total_noise(row)):
+        if abs(row["error"]) > max(LIMITS["mean"] * unit, SIGMAS["mean"] * total_noise(row)):
             found.append(f"mean{suffix}")
         if row["bias_at_least"] > LIMITS["bias"] * unit:
             found.append(f"RMSE{suffix}")
@@ -259,7 +226,7 @@ def line(key: str, row: dict) -> list[str]:
     block = row["block"]
     return [
         key, verdict(row), row["solver"],
-        f"{both(row['x']['mean'])} +- {100 * total_noise(row):.2f}",
+        f"{both(row['error'])} +- {100 * total_noise(row):.2f}",
         both(row["x"]["rmse"], ".2f"),
         f"{both(row['bias'], '.2f')} > {100 * max(row['bias_at_least'], 0):.2f}",
         f"{both(block['error'], '+.1f')} +- {100 * block['noise']:.1f}",
@@ -291,28 +258,29 @@ def is_outdated(row: dict | None, case: RandomScene, seconds: float) -> bool:
 def main() -> None:
     """Compute missing rows within the budget."""
     parser = parser_of(__doc__)
-    parser.add_argument("--count", type=int, default=60, help="scenes")
-    parser.add_argument("--seed", type=int, default=1, help="of the scenes")
+    parser.add_argument("--count", type=int, default=20, help="scenes of each seed")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[301, 302, 303])
     parser.add_argument("--only", type=int, nargs="+", help="numbers of scenes")
-    parser.add_argument("--seconds", type=float, default=12, help="of a reference")
+    parser.add_argument("--seconds", type=float, default=60, help="of a reference")
     parser.add_argument("--budget", type=float, default=480, help="no scene is begun later")
     add_document(parser)
     args = parser.parse_args()
     begin()
     folder = args.output / "random_scenes"
     folder.mkdir(parents=True, exist_ok=True)
-    store, started = Store(folder / f"{args.seed}.json"), time.perf_counter()
-    numbers = range(args.count) if args.only is None else args.only
-    for number in numbers:
-        key, case = str(number), RandomScene.draw(args.seed, number)
-        if args.force or is_outdated(store.rows.get(key), case, args.seconds):
-            store.rows.pop(key, None)
-        if key not in store.rows and time.perf_counter() - started > args.budget:
-            print(f"{number}: not computed yet; run again")
-            continue
-        row = store.row(key, partial(compute, case, args.seconds, folder))
-        print(" | ".join(line(key, row)), flush=True)
-    rows = {str(n): store.rows[str(n)] for n in numbers if str(n) in store.rows}
+    started, rows = time.perf_counter(), {}
+    for seed in args.seeds:
+        store = Store(folder / f"{seed}.json")
+        for number in range(args.count) if args.only is None else args.only:
+            key, case = str(number), RandomScene.draw(seed, number)
+            if args.force or is_outdated(store.rows.get(key), case, args.seconds):
+                store.rows.pop(key, None)
+            if key not in store.rows and time.perf_counter() - started > args.budget:
+                print(f"{seed}:{number}: not computed yet; run again")
+                continue
+            row = store.row(key, partial(compute, case, args.seconds, folder))
+            rows[f"{seed}:{number}"] = row
+            print(" | ".join(line(f"{seed}:{number}", row)), flush=True)
     wrong = {
         k: row for k, row in rows.items() if not verdict(row).startswith(("agrees", "refused"))
     }
@@ -321,7 +289,7 @@ def main() -> None:
     counts = counts_of(rows)
     print("\n" + ", ".join(f"{word}: {count}" for word, count in counts.items()))
     if args.document:
-        replace_tables(args.document, {"random-scenes": short_table(rows, wrong)})
+        replace_tables(args.document, {"random-scenes": short_table(rows)})
 
 
 def counts_of(rows: dict[str, dict]) -> dict[str, int]:
@@ -330,14 +298,14 @@ def counts_of(rows: dict[str, dict]) -> dict[str, int]:
     return {word: words.count(word) for word in sorted(set(words))}
 
 
-def short_table(rows: dict[str, dict], wrong: dict[str, dict]) -> Table:
-    """Tabulate the counts, and the errors [%] of the scenes that do not agree."""
+def short_table(rows: dict[str, dict]) -> Table:
+    """Tabulate the counts, and the errors [%] of all scenes."""
     body = [["all", f"{count} {word}", "", "", ""] for word, count in counts_of(rows).items()]
-    for key, row in wrong.items():
+    for key, row in rows.items():
         cells = line(key, row)
         means, block = (cells[column].split(" (")[0] for column in (3, 6))
         noises = [cells[column].partition("+- ")[2] for column in (3, 6)]
-        errors = [f"{v} ({n})" for v, n in zip((means, block), noises, strict=True)]
+        errors = [f"{v} ({n})" if n else v for v, n in zip((means, block), noises, strict=True)]
         body.append([key, cells[1], *errors, cells[8]])
     return Table("", ["scene", "verdict", "mean [%]", "worst block [%]", "about"], body)
 

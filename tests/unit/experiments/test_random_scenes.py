@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.validation.random_scenes import generate, run
+from experiments.validation.random_scenes import generate, references, run
 from experiments.validation.random_scenes.generate import SIDE, RandomScene
 
 COUNT = 60
@@ -137,7 +137,7 @@ def test_placements_keep_angles():
 def rendered(error, noise: float = 0.02, seed: int = 0, unscattered: float = 0.5) -> dict:
     """Return a row for images of mean 1 with an ``error`` and noise."""
     random = np.random.default_rng(seed)
-    a, b, x, y = (1 + noise * random.normal(size=(32, 32, 3)) for _ in range(4))
+    a, b, x, y = (1 + noise * random.normal(size=(24, 24, 3)) for _ in range(4))
     direct = np.full_like(a, unscattered)
     return run.compare(a, b, direct, x + error, y + error) | {"solver": "sweep"}
 
@@ -160,28 +160,52 @@ def test_an_error_of_the_mean_is_found(share, unscattered, expected):
 
 
 def test_an_error_without_a_mean_is_found():
-    signs = np.where(np.indices((32, 32)).sum(axis=0) % 2, 1, -1)[..., None]
+    signs = np.where(np.indices((24, 24)).sum(axis=0) % 2, 1, -1)[..., None]
     assert run.verdict(rendered(0.02 * signs, unscattered=0.0)) == "DISAGREES: RMSE"
 
 
 def test_a_wrong_block_is_found_where_it_is():
-    error = np.zeros((32, 32, 3))
-    error[8:12, 20:24] = 0.06
+    error = np.zeros((24, 24, 3))
+    error[6:12, 18:24] = 0.036
     row = rendered(error, unscattered=0.0)
     assert run.verdict(row) == "DISAGREES: block"
-    assert row["block"]["at"] == [8, 20]
-    assert row["block"]["error"] == pytest.approx(0.06, abs=4 * row["block"]["noise"])
+    assert row["block"]["at"] == [6, 18]
+    assert row["block"]["error"] == pytest.approx(0.036, abs=4 * row["block"]["noise"])
 
 
 def test_error_absent_from_another_cache_is_noise():
     random = np.random.default_rng(3)
-    a, b, x, y = (1 + 0.01 * random.normal(size=(32, 32, 3)) for _ in range(4))
+    a, b, x, y = (1 + 0.01 * random.normal(size=(24, 24, 3)) for _ in range(4))
     row = run.compare(a, b, np.zeros_like(a), x + 0.03, y - 0.03) | {"solver": "sweep"}
     assert run.verdict(row) == "undecided"
 
 
 def test_what_the_reference_does_not_resolve_is_undecided():
     assert run.verdict(rendered(0.0, noise=0.3)) == "undecided"
+
+
+def test_references_are_refined_until_they_are_exact_enough(tmp_path, monkeypatch):
+    """Batches are added until the standard error suffices; a stored reference is continued."""
+    seeds, random = [], np.random.default_rng(5)
+
+    def rendered(_, __, seed: int) -> np.ndarray:
+        seeds.append(seed)
+        return np.full((24, 24, 3), 1 + 0.03 * random.normal())
+
+    monkeypatch.setattr(references, "picture", rendered)
+    first = references.Reference("volpath", 50, 16)
+    first.refine(None, seconds=0.0)  # the time is spent at once
+    assert len(first.means) == 2
+    assert not first.is_enough
+    first.save(tmp_path / "a.npz", "scene")
+    assert references.Reference.read(tmp_path / "a.npz", "another scene") is None
+    found = references.Reference.read(tmp_path / "a.npz", "scene")
+    found.refine(None, seconds=60.0)
+    assert found.is_enough
+    assert len(set(seeds)) == len(seeds) == len(found.means) >= references.BATCHES
+    assert found.noise == pytest.approx(references.TARGET, rel=0.1)
+    a, b = found.halves()
+    assert 0.5 * (a.mean() + b.mean()) == pytest.approx(np.mean(found.means), rel=1e-2)
 
 
 def test_outdated_rows_are_computed_again(drawn):
@@ -196,7 +220,7 @@ def test_outdated_rows_are_computed_again(drawn):
 
 
 def test_nonfinite_images_and_failures_are_reported():
-    row = rendered(np.where(np.arange(32) == 3, np.nan, 0.0)[:, None, None])
+    row = rendered(np.where(np.arange(24) == 3, np.nan, 0.0)[:, None, None])
     assert run.verdict(row) == "NOT FINITE"
     assert run.verdict({"failed": "no", "refused": True}) == "refused"
     assert run.verdict({"failed": "no", "refused": False}) == "ERROR"
