@@ -124,8 +124,12 @@ def reference(case: RandomScene, seconds: float, folder: Path) -> Reference:
 
 
 def _begin(case: RandomScene, folder: Path) -> Reference:
-    """Choose the integrator of least variance times time, and the samples of a batch."""
-    names = ("volpath", "volpathmis") if case.is_chromatic else ("volpath",)
+    """Choose the integrator, its `rr_depth` of least variance times time, and samples of a batch.
+
+    It is volpathmis where the extinction is chromatic: the weights of volpath's paths grow with
+    each collision there, and a few of large weight can be missing from its mean and its noise.
+    """
+    names = ("volpathmis",) if case.is_chromatic else ("volpath",)
     candidates = [(name, ROULETTE[0]) for name in names]
     if case.max_depth < 0 and case.depth >= 5:
         candidates += [(name, ROULETTE[1]) for name in names]

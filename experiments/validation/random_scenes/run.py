@@ -6,11 +6,11 @@
 Each scene (see generate.py) is loaded by `mi.load_dict`, with the integrator ``irrcache`` at
 default settings except ``max_depth`` and ``hide_emitters``, and rendered with two values of
 ``cache_seed``, which separates the noise of the cache from its bias; with up to six where two do
-not determine the mean. The reference (see references.py) is rendered by volpath (volpathmis if it
-is cheaper) in independent batches until the standard error of the mean radiance is a quarter of a
-percent, for at most ``--seconds`` of processor time. A scene whose difference of means has a
-standard error above a third of a percent counts as undecided; the table marks scenes for which only
-the mean of the volume alone is uncertain.
+not determine the mean. The reference (see references.py) is rendered by volpath (volpathmis where
+the extinction is chromatic) in independent batches until the standard error of the mean radiance is
+a quarter of a percent, for at most ``--seconds`` of processor time. A scene whose difference of
+means has a standard error above a third of a percent counts as undecided; the table marks scenes
+for which only the mean of the volume alone is uncertain.
 
 The table has the difference of the means; the RMSE, net of the reference's noise, by
 mean((x - a)(x - b)); its bias, by mean((x - a)(y - b)), with a lower bound of three standard
