@@ -415,8 +415,8 @@ SLIPS = (
     Mutant(
         "noise of a difference taken for that of one run (metrics)",
         "compare/metrics.py",
-        "_root(0.5 * np.mean(",
-        "_root(np.mean(",
+        "root(0.5 * np.mean(",
+        "root(np.mean(",
         (METRICS_OF_RUNS,),
     ),
 )

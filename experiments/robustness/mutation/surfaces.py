@@ -29,8 +29,8 @@ SURFACES = (
     Mutant(
         "radiance behind a surface is attenuated before it begins",
         "solvers/discrete_ordinates/kernel.py",
-        "carried.append(dr.select(crosses, y - lost[1], x - lost[0]))",
-        "carried.append(dr.select(crosses, y - lost[1] - lost[0], x - lost[0]))",
+        "carried.append(dr.select(crosses, y - lost[1], x - lost[0] + y))",
+        "carried.append(dr.select(crosses, y - lost[1] - lost[0], x - lost[0] + y))",
         (CROSSINGS, AMONG),
     ),
     Mutant(

@@ -30,7 +30,7 @@ import numpy as np
 
 import mitsuba_irrcache  # noqa: F401 (registers the plugin)
 from experiments.support.case_rows import CaseRows, with_budget, with_reference
-from experiments.validation.random_scenes.run import picture, pilot
+from experiments.validation.random_scenes.references import picture, pilot
 from experiments.validation.tolerance.scenes import load, unseen
 from mitsuba_irrcache.compare.metrics import net_mse
 from mitsuba_irrcache.compare.tables import Table
