@@ -257,15 +257,18 @@ class AreaLight(DirectLight):
         return -dr.log(dr.maximum(passed / dr.maximum(total, 1e-30), 1e-30))
 
     def _depth_error(self, scene: mi.Scene) -> float:
-        """Estimate the relative error of the irradiance due to interpolated optical depths.
+        """Estimate the relative error of the radiance that is scattered once, due to interpolated
+        optical depths.
 
-        It is evaluated at random positions in random voxels.
+        It is evaluated at random positions in random voxels. These are weighted by the extinction:
+        interpolation errs most where radiance enters dense matter, which scatters most of it.
         """
         p, stream = self._test_positions()
         count = dr.opaque(mi.UInt32, MOST_SAMPLES)
         transmitted, _, weight, *_ = self._sums(scene, p, count, stream)
         exact = dr.mean(transmitted) / dr.maximum(weight, 1e-20)
         scale = dr.select(self._medium.contains(p), self._solid_angle.at(p), 0)
+        scale *= channel_mean(self._medium.sigma_t.at_world(p))
         if self._lines == EACH:  # without the noise of few points
             depth = self._depth_to_points(self.extinction.at_world(p), p, count, shift_at(p))
         else:

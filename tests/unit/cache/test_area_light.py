@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from experiments.validation.limits.reference import Extinction
+from experiments.validation.limits.reference import _light as light_at
 from mitsuba_irrcache.cache.area_light import AreaLight, area_lights_of
+from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels
 from mitsuba_irrcache.scene.compile import compile_scene
@@ -64,3 +68,32 @@ def test_faces_that_an_emitter_irradiates_at_grazing_angles(scenes):
             error = found / transmittance(p.T) - 1
             assert np.abs(error).max() < 0.04, (axis, side, inwards)
             assert abs(error.mean()) < 0.015, (axis, side, inwards)
+
+
+def test_coarse_data_of_high_contrast(scenes):
+    """The light of a wide emitter that random matter scatters towards a camera is right to 1.5 %,
+    with three voxels along each data voxel, against a quadrature that shares no code.
+
+    Where the irradiance decided which lines have the smallest error, wherever matter is, this was
+    6.5 % too dark.
+    """
+    values = np.concatenate([np.geomspace(1e-5, 1e-3, 256), np.linspace(0.4, 1, 256)])
+    values = np.random.default_rng(3).permutation(values * 17).reshape(8, 8, 8)
+    cube = mi.ScalarTransform4f().translate(-1).scale(2)
+    volume = mi.VolumeGrid(np.float32(values[..., None]))
+    sigma_t = {"type": "gridvolume", "grid": volume, "raw": True, "to_world": cube}
+    shape = scenes.boundary({"type": "heterogeneous", "sigma_t": sigma_t, "albedo": 0.8})
+    place = mi.ScalarTransform4f().look_at([0, HEIGHT, 0], [0, 0, 0], [0, 0, 1]).scale(HALF_WIDTH)
+    lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
+    scene = scenes.load({"type": "irrcache", "solver": "sweep"}, shape, emitter=lamp)
+    (medium,) = compile_scene(scene).visible
+    grid = Grid.near_cubic(medium.frame, 24)
+    (light,) = area_lights_of(scene, medium, grid, active_voxels(medium, grid), samples=1024)
+    p = mi.Point3f(np.float32(np.random.default_rng(1).uniform(-1, 1, (3, 1 << 15))))
+    extinction = Extinction(np.float32(values))
+    found = DirectLightAlongRays(light).at(p, mi.Bool(True))[0]
+    expected = 4 * dr.pi * light_at("isotropic", scene.emitters()[0], extinction, p, p, 64)
+    towards = mi.Vector3f(0, 0, -1)
+    weight = extinction.at(p) * extinction.transmittance(p, towards, mi.Float(10))
+    ratio = dr.sum(weight * found)[0] / dr.sum(weight * expected)[0]
+    assert ratio == pytest.approx(1, abs=0.015)
