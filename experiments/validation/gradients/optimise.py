@@ -1,11 +1,12 @@
 """A density from eight views, with this integrator and with ``prbvolpath``.
 
-    python -m experiments.validation.gradients.optimise [--seconds 24] [--voxels 24]
+    python -m experiments.validation.gradients.optimise [--seconds 24] [--voxels 24] [--volume FILE]
 
-Adam fits the extinction of a cube under a sky and a sun, from a start without structure. Prints the
-error of two views that the optimisation does not see, relative to their mean, against CPU time;
-``prbvolpath`` with several numbers of samples and step sizes, of which the best counts. The same by
-``fit`` with L-BFGS and with Adam, and then the error of the extinction, relative to its mean.
+Adam fits the extinction of a cube, or that of a ``--volume`` (.vol) in means over its voxels, under
+a sky and a sun, from a start without structure. Prints the error of two views that the optimisation
+does not see, relative to their mean, against CPU time; ``prbvolpath`` with several numbers of
+samples and step sizes, of which the best counts. The same by ``fit`` with L-BFGS and with Adam, and
+then the error of the extinction, relative to its mean.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ import mitsuba as mi
 import numpy as np
 
 from experiments.support.options import begin
-from experiments.validation.gradients.cases import SKY, SUN, Case
+from experiments.validation.gradients.cases import EDGE, SKY, SUN, Case
 from experiments.validation.gradients.differences import key_of
 from mitsuba_irrcache.gradients.fit import Result, Settings, View
 from mitsuba_irrcache.gradients.fit import fit as run_fit
+from mitsuba_irrcache.io.mitsuba_vol import read_vol
 
 VIEWS, UNSEEN = 8, 2
 SIZE = 64
@@ -53,6 +55,26 @@ METHODS = (
 )
 
 
+@dataclass(frozen=True)
+class RealCase(Case):
+    """A case whose density is that of a ``file``, in means over blocks of its voxels."""
+
+    file: str = ""
+
+    def sigma_t(self) -> np.ndarray:
+        """Extinction (z, y, x, channel)."""
+        values = read_vol(self.file)[0][..., 0]
+        longest = max(values.shape)
+        ends = np.linspace(0, longest, self.data + 1).round().astype(int)
+        gaps = [((longest - n) // 2, longest - n - (longest - n) // 2) for n in values.shape]
+        values = np.pad(values, gaps).astype(np.float64)
+        for axis in range(3):
+            sums = np.add.reduceat(values, ends[:-1], axis=axis)
+            values = sums / np.diff(ends).reshape([-1 if a == axis else 1 for a in range(3)])
+        values *= self.depth * self.data / EDGE / values.max()
+        return values[..., None].astype(np.float32)
+
+
 def main() -> None:
     """Run all methods."""
     parser = argparse.ArgumentParser(
@@ -60,29 +82,34 @@ def main() -> None:
     )
     parser.add_argument("--voxels", type=int, default=24)
     parser.add_argument("--seconds", type=float, default=24.0, help="CPU time of each method")
+    parser.add_argument("--volume", default="", metavar="FILE", help="a .vol of the density")
+    parser.add_argument("--methods", default="", help="part of the names of integrators to run")
     options = parser.parse_args()
     begin()
     mi.set_variant("llvm_ad_mono")
     mi.set_log_level(mi.LogLevel.Error)
-    case = Case(
-        options.voxels,
-        options.voxels,
-        depth=8.0 / options.voxels,
-        albedo=(0.82,),
-        emitters=lambda: {"sky": SKY, "sun": SUN},
-    )
+    settings = {
+        "depth": 8.0 / options.voxels,
+        "albedo": (0.82,),
+        "emitters": lambda: {"sky": SKY, "sun": SUN},
+    }
+    case = Case(options.voxels, options.voxels, **settings)
+    if options.volume:
+        case = RealCase(options.voxels, options.voxels, file=options.volume, **settings)
     scene = case.load(type="volpath", max_depth=-1)
     truth = [np.array(mi.render(scene, sensor=view, spp=512)) for view in views()]
     for method in METHODS:
+        if options.methods not in f"{method.integrator} {method.spp} {method.rate}":
+            continue
         marks = fit(case, method, truth, options.seconds)
         text = ", ".join(f"{error:.3f} after {time:.0f} s" for time, error in marks)
         name = f"{method.integrator}{{cache_spp={method.directions}}}"
         print(f"{name:24} spp {method.spp:2} rate {method.rate:5}: {text}", flush=True)
-    for settings in (Settings(40), Settings(40, "adam", rate=0.4)):
-        marks, density = by_fit(case, settings, truth)
+    for own in (Settings(40), Settings(40, "adam", rate=0.4)):
+        marks, density = by_fit(case, own, truth)
         text = ", ".join(f"{error:.4f} after {time:.0f} s" for time, error in marks)
         error = np.sqrt(np.mean(np.square(density - case.sigma_t()))) / case.sigma_t().mean()
-        print(f"fit, {settings.method}: {text}; extinction {error:.2f}", flush=True)
+        print(f"fit, {own.method}: {text}; extinction {error:.2f}", flush=True)
 
 
 def sensor(number: int) -> dict:
