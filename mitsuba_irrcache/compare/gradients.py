@@ -24,8 +24,7 @@ import numpy as np
 
 from mitsuba_irrcache.core.argument_types import whole
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients.fit import key_of
-from mitsuba_irrcache.io.scene_files import parse_parameters, unknown_properties
+from mitsuba_irrcache.io.scene_files import key_of, parse_parameters, unknown_properties
 
 from .command import budgets_of
 from .metrics import net_mse, root

@@ -24,6 +24,7 @@ import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.files import atomic_write
+from mitsuba_irrcache.io.scene_files import key_of
 from mitsuba_irrcache.machine.extras import require
 
 #: Directions of the cache, if the integrator does not set ``cache_spp``, by the fraction of all
@@ -182,25 +183,6 @@ def fit(
     """
     run = _Fit(scene, views, names, settings or Settings(), held_out, start, report, every)
     return run.with_adam() if run.settings.method == "adam" else run.with_lbfgs()
-
-
-def key_of(params: mi.SceneParameters, name: str) -> str:
-    """Return the key in ``params`` that ``name`` abbreviates: the key itself, or a component of it
-    between dots that occurs in only one key of an array, such as ``sigma_t``, ``albedo``,
-    ``emission`` or the id of an emitter.
-
-    Raises IrrcacheError if no key, or more than one, matches.
-    """
-    arrays = [k for k in params.keys() if k.endswith((".data", ".value")) and name in k.split(".")]
-    if name in params.keys():
-        return name
-    if len(arrays) != 1:
-        found = ", ".join(f'"{key}"' for key in arrays) or "none"
-        raise IrrcacheError(
-            f'fit: "{name}" must be a key of mi.traverse(scene), or stand in exactly one that ends '
-            f'in "data" or "value"; found: {found}.'
-        )
-    return arrays[0]
 
 
 class _Fit:

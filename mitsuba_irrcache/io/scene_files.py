@@ -297,3 +297,22 @@ def has_cache(scene: mi.Scene) -> bool:
     method = getattr(scene.integrator(), "prepare", None)
     # Mitsuba's differentiable integrators have an unrelated method of this name.
     return callable(method) and "scene" in inspect.signature(method).parameters
+
+
+def key_of(params: mi.SceneParameters, name: str) -> str:
+    """Return the key in ``params`` that ``name`` abbreviates: the key itself, or a component of it
+    between dots that occurs in only one key of an array, such as ``sigma_t``, ``albedo``,
+    ``emission`` or the id of an emitter.
+
+    Raises IrrcacheError if no key, or more than one, matches.
+    """
+    arrays = [k for k in params.keys() if k.endswith((".data", ".value")) and name in k.split(".")]
+    if name in params.keys():
+        return name
+    if len(arrays) != 1:
+        found = ", ".join(f'"{key}"' for key in arrays) or "none"
+        raise IrrcacheError(
+            f'"{name}" must be a key of mi.traverse(scene), or stand in exactly one that ends '
+            f'in "data" or "value"; found: {found}.'
+        )
+    return arrays[0]

@@ -203,7 +203,6 @@ def test_no_kernel_is_compiled_for_another_camera_or_size(session, kernels):
 
 def test_no_kernel_is_compiled_for_another_edit(session, kernels):
     """Other volumes of the same size and kind are displayed by the kernels that exist."""
-
     shapes = set()
 
     def display(top: float) -> None:
@@ -213,8 +212,8 @@ def test_no_kernel_is_compiled_for_another_edit(session, kernels):
         shapes.add(session._light.parts[0].cache.grid.shape)
         dr.sync_thread()
 
-    session.call(lambda: display(1.0))
-    used = session.call(lambda: kernels(lambda: [display(6.0), display(9.0)]))
+    session.call(lambda: display(6.0))
+    used = session.call(lambda: kernels(lambda: [display(7.0), display(8.0)]))
     assert len(shapes) == 3
     assert used and all(k["cache_hit"] for k in used)
 
