@@ -277,7 +277,7 @@ class AdjointTransport:
         dr.eval(source, adjoint)
         total = dr.zeros(mi.Float, self.grid.voxel_count)
         for number, (part, own) in enumerate(zip(self.parts, adjoint, strict=True)):
-            # Of suns, `add_paths_to_light` has these derivatives.
+            # `add_paths_to_light` adds the derivatives with respect to suns.
             ordinates = part.before(self.lights.even, [channel])
             if len(ordinates.directions):
                 scattered = none if number else source

@@ -133,7 +133,7 @@ def compare(a, b, unscattered, x, y) -> dict:
     grey = 0.25 * ((a - b).mean(axis=-1) ** 2)  # variance of the reference's grey pixels
     own = 0.5 * (x - y).mean(axis=-1) ** 2  # likewise of an image of ours, camera and cache
     found["noise"] = float(np.sqrt(grey.mean() / grey.size) / mean)
-    # Of the mean of both images: of all pixels (cache), and of each (camera).
+    # Standard errors of the mean image: by the cache, common to all pixels, and by camera samples.
     common, each = abs((x - y).mean()) / 2, np.sqrt(own.mean() / own.size / 2)
     found["own_noise"] = float(max(common, each) / mean)
     found["error"] = float((0.5 * (x + y) - r).mean() / mean)
