@@ -13,7 +13,7 @@ and of means over blocks of voxels, which noise affects less.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import process_time
@@ -61,18 +61,33 @@ def gradient(
     ``name`` abbreviates the parameter as in `key_of`.
     """
     params = mi.traverse(scene)
-    key = key_of(params, name)
-    leaf = type(params[key])(dr.detach(params[key]))
-    dr.enable_grad(leaf)
-    params[key] = leaf
+    key, begun = key_of(params, name), process_time()
+    found = gradients_of(scene, params, [key], dr.mean, sensor=sensor, spp=spp, seed=seed)
+    return found[key], process_time() - begun
+
+
+def gradients_of(
+    scene: mi.Scene,
+    params: mi.SceneParameters,
+    keys: Sequence[str],
+    objective: Callable[[mi.TensorXf], mi.Float],
+    **options: int,
+) -> dict[str, np.ndarray]:
+    """Return the gradients of an ``objective`` of the image with respect to the parameters of these
+    ``keys``; ``options`` are those of `mi.render`. Afterwards the parameters have no gradients.
+    """
+    # Environments keep another array than they are given.
+    leaves = {key: type(params[key])(dr.detach(params[key])) for key in keys}
+    for key, leaf in leaves.items():
+        dr.enable_grad(leaf)
+        params[key] = leaf
     params.update()
-    begun = process_time()
-    dr.backward(dr.mean(mi.render(scene, params, sensor=sensor, spp=spp, seed=seed)))
-    found = np.array(dr.grad(leaf), dtype=np.float64)
-    spent = process_time() - begun
-    params[key] = dr.detach(leaf)
+    dr.backward(objective(mi.render(scene, params, **options)))
+    found = {key: np.array(dr.grad(leaf), dtype=np.float64) for key, leaf in leaves.items()}
+    for key, leaf in leaves.items():
+        params[key] = dr.detach(leaf)
     params.update()
-    return found, spent
+    return found
 
 
 def averages(

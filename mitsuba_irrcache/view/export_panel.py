@@ -39,12 +39,8 @@ class ExportPanel:
         editing: Editing,
         current_view: Callable[[], View | None],
     ) -> None:
-        self._client, self._session, self._folder, self._current_view = (
-            client,
-            session,
-            folder,
-            current_view,
-        )
+        self._client, self._session, self._folder = client, session, folder
+        self._current_view = current_view
         self._gone, self._cancelled = False, threading.Event()
         gui = client.gui
         with gui.add_folder("Save", order=6, expand_by_default=False):

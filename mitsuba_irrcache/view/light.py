@@ -93,7 +93,7 @@ class Light:
         self.seconds = 0.0
         #: whether the last refinement raised an exception
         self.failed = False
-        self._seen: dict[tuple[bool, bool], tuple[int, CacheSnapshot]] = {}
+        self._snapshots: dict[tuple[bool, bool], tuple[int, CacheSnapshot]] = {}
 
     @property
     def parts(self) -> list[CachedMedium]:
@@ -187,7 +187,7 @@ class Light:
     def snapshot(self, layered: bool, with_error: bool) -> CacheSnapshot:
         """Return a copy of the current caches; `camera_rays_of` computes the requested layers."""
         key = layered, with_error
-        known = self._seen.get(key)
+        known = self._snapshots.get(key)
         if known is None or known[0] != self.revision:
             parts = self.parts if self._coarse is None else [self._coarse]
             s = self.march
@@ -196,8 +196,8 @@ class Light:
             )
             known = self.revision, CacheSnapshot(self.scene, parts, camera_rays, layered)
             # Release the fields of the previous caches: they are as large as the cache itself.
-            self._seen = {k: v for k, v in self._seen.items() if v[0] == self.revision}
-            self._seen[key] = known
+            self._snapshots = {k: v for k, v in self._snapshots.items() if v[0] == self.revision}
+            self._snapshots[key] = known
         return known[1]
 
 

@@ -398,7 +398,7 @@ class Session:
 
     def _give_way(self) -> None:
         """Abort an image at rest between two bands if a camera has moved, or for an edit."""
-        if self._is_called or any(w.fresh and w.is_moving for w in self._windows):
+        if self._is_called or any(w.needs_coarse for w in self._windows):
             raise Superseded
 
     def _refine_picture(self) -> bool:

@@ -113,7 +113,9 @@ class Visitor:
         self._reset.on_click(lambda _: self._go_to(self._sensor.value))
         self._channel.receive("size", self._set_size, self._key)
         self._channel.receive("background", self._set_background, self._key)
-        self._export = ExportPanel(self.client, self.session, self.folder, self.editing, self._seen)
+        self._export = ExportPanel(
+            self.client, self.session, self.folder, self.editing, self._current_view
+        )
 
     def _set_look(self) -> None:
         kind, tone, exposure = self._kind.value, self._tone.value, self._exposure.value
@@ -178,7 +180,7 @@ class Visitor:
         self._fov.value = round(camera.fov, 1)
         self.look_again()
 
-    def _seen(self) -> View | None:
+    def _current_view(self) -> View | None:
         """Return the view without its comparison, None if there is none yet."""
         return self._view and replace(self._view, compared="off")
 

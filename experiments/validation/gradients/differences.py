@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from experiments.validation.gradients.cases import EDGE, Case, blob
+from mitsuba_irrcache.compare.gradients import gradients_of
 
 #: Camera samples of each pixel for gradients, if nothing else is said.
 SPP_GRAD = 64
@@ -65,19 +66,16 @@ def gradients(
     """Gradients of the objective by the parameters of these names."""
     params = mi.traverse(scene)
     keys = {name: key_of(params, name) for name in names}
-    # Environments keep another array than they are given.
-    leaves = {key: type(params[key])(params[key]) for key in keys.values()}
-    for key, leaf in leaves.items():
-        dr.enable_grad(leaf)
-        params[key] = leaf
-    params.update()
-    image = mi.render(scene, params, spp=spp, seed=seed)
-    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32))))
-    found = {name: np.array(dr.grad(leaves[key]), dtype=np.float64) for name, key in keys.items()}
-    for key, leaf in leaves.items():
-        params[key] = dr.detach(leaf)
-    params.update()
-    return found
+    weighted = mi.TensorXf(weights.astype(np.float32))
+    found = gradients_of(
+        scene,
+        params,
+        list(keys.values()),
+        lambda image: dr.sum(image * weighted),
+        spp=spp,
+        seed=seed,
+    )
+    return {name: found[key] for name, key in keys.items()}
 
 
 def derivatives(
