@@ -74,6 +74,7 @@ class Session:
         self._light: Light | None = None  # the caches under refinement
         self._shown: Light | None = None  # displayed; the previous caches until new ones exist
         self._shown_samples = 0
+        self._holds_previous = False  # whether windows may still hold the previous caches
         self._revision = 0  # number of the displayed state, counted across edits
         self._checked = 0.0
         # tasks while no camera moves, in turn
@@ -276,6 +277,8 @@ class Session:
             self._tasks.popleft()()
         if self._show_coarse():
             return True
+        if self._holds_previous:
+            self._release_previous()
         if any(w.is_moving for w in self._windows):
             return False
         if self._show_resting(first=True):
@@ -319,14 +322,17 @@ class Session:
         if other or not light.samples or light.samples >= GROWTH * self._shown_samples:
             self._revision += 1
             self._shown, self._shown_samples = light, light.samples
-            if other:
-                self._release_previous()
+            self._holds_previous |= other
         elif not self._wants_light:
             self._revision += 1
         self._publish_status()
 
     def _release_previous(self) -> None:
-        """Release the previous caches, whose arrays are as large as the displayed ones."""
+        """Release the previous caches, whose arrays are as large as the displayed ones.
+
+        This takes some hundredths of a second, hence only after the first image with new caches.
+        """
+        self._holds_previous = False
         for window in list(self._windows):
             window.release_others(self._shown)
         gc.collect()  # media with surfaces are part of reference cycles

@@ -39,7 +39,7 @@ def main() -> None:
         results["  of it the browser [s]"] = _first(window) - window.opened
         window.wait_for("at rest|final")
         time.sleep(2)
-        for measure in (orbiting, latency, stopping, editing):
+        for measure in (orbiting, latency, stopping, editing, turning_the_sun):
             found = measure(window, args.repeats)
             for name, value in found.items():
                 print(f"{name:<48}{value:10.3f}", flush=True)
@@ -140,6 +140,25 @@ def editing(window: Window, repeats: int) -> dict[str, float]:
     return {
         f"picture after an edit ({label}), median [s]": float(np.median(found)),
         "  slowest edit [s]": max(found),
+    }
+
+
+def turning_the_sun(window: Window, repeats: int) -> dict[str, float]:
+    """Measure from a new direction of the sun, clicked on its sphere, to the new image."""
+    sphere = window.page.locator("irrcache-light canvas")
+    if not sphere.count():
+        return {}
+    found = []
+    for number in range(repeats):
+        window.wait_for("^final", 60)  # no other image is displayed from now on
+        shown = len(window.shown())
+        began = time.time()
+        sphere.click(position={"x": 45 - 6 * number, "y": 20 + 4 * number})
+        window.wait_for_picture(shown)
+        found.append(_seen(window, shown, began) - began)
+    return {
+        "picture after turning the sun, median [s]": float(np.median(found)),
+        "  slowest turn [s]": max(found),
     }
 
 
