@@ -14,7 +14,8 @@ import numpy as np
 from mitsuba_irrcache.cli.render import REPLACED, add_scene_options
 from mitsuba_irrcache.core.argument_types import whole
 from mitsuba_irrcache.errors import IrrcacheError, origin
-from mitsuba_irrcache.gradients.fit import LOSSES, METHODS, Result, Settings, View, fit
+from mitsuba_irrcache.gradients.fit import fit
+from mitsuba_irrcache.gradients.fit_state import LOSSES, METHODS, Result, Settings, View
 from mitsuba_irrcache.io.mitsuba_vol import write_vol
 from mitsuba_irrcache.io.scene_files import (
     check_scene_file,

@@ -40,7 +40,11 @@ class FixedPointSums:
     def add(self, index: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
         """Add a ``value`` to the sum at ``index``."""
         scaled = clipped(value * self._scale, -self._limit, self._limit)
-        dr.scatter_reduce(dr.ReduceOp.Add, self.sums, mi.Int64(scaled), index, active)
+        # On processors, Dr.Jit's default first adds up equal indices within a vector: for the
+        # voxels around camera rays that takes longer than one atomic addition for each lane.
+        on_processor = dr.backend_v(self.sums) == dr.JitBackend.LLVM
+        mode = dr.ReduceMode.Direct if on_processor else dr.ReduceMode.Auto
+        dr.scatter_reduce(dr.ReduceOp.Add, self.sums, mi.Int64(scaled), index, active, mode)
 
     def values(self) -> mi.Float:
         """Return the sums."""

@@ -11,7 +11,8 @@ import pytest
 from experiments.validation.gradients.cases import SUN, Case
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients.fit import Result, Settings, View, _roughness, fit
+from mitsuba_irrcache.gradients.fit import _roughness, fit
+from mitsuba_irrcache.gradients.fit_state import Result, Settings, View
 from mitsuba_irrcache.io.mitsuba_vol import read_vol, write_vol
 from tests.support.scene_xml import FOG_IN_A_BOX
 
@@ -60,6 +61,18 @@ def test_a_fit_explains_views_that_it_does_not_see(mono, method, steps):
     assert losses[-1] < 0.02 * losses[0]
     assert errors[-1] < 0.5 * errors[0]
     assert (result.values["sigma_t"] >= 0).all()
+
+
+def test_a_fit_by_another_integrator_that_has_gradients(mono):
+    """The same optimiser, for comparisons."""
+    seen, scene = views(), CASE.load(type="prbvolpath", max_depth=-1)
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if ".albedo.data" in k]
+    params[key] = mi.TensorXf(np.full(params[key].shape, 0.3, np.float32))
+    params.update()
+    result = fit(scene, seen[:2], ["albedo"], Settings(steps=8, method="adam", spp=16))
+    dense = CASE.sigma_t() > 0.5 * CASE.sigma_t().max()
+    assert result.values["albedo"][dense].mean() > 0.6  # the truth is 0.85 to 0.93
 
 
 def test_a_fit_may_start_without_matter_and_find_the_albedo_too(rgb):

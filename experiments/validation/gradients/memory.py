@@ -18,7 +18,8 @@ import psutil
 from experiments.support.options import begin
 from experiments.validation.gradients.cases import SUN, Case
 from experiments.validation.gradients.differences import key_of
-from mitsuba_irrcache.gradients.fit import Result, Settings, View, fit
+from mitsuba_irrcache.gradients.fit import fit
+from mitsuba_irrcache.gradients.fit_state import Result, Settings, View
 
 #: Steps after which memory is printed.
 MARKS = (10, 50, 100, 200, 350, 500)

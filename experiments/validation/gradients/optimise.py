@@ -22,8 +22,8 @@ import numpy as np
 from experiments.support.options import begin
 from experiments.validation.gradients.cases import EDGE, SKY, SUN, Case
 from experiments.validation.gradients.differences import key_of
-from mitsuba_irrcache.gradients.fit import Result, Settings, View
 from mitsuba_irrcache.gradients.fit import fit as run_fit
+from mitsuba_irrcache.gradients.fit_state import Result, Settings, View
 from mitsuba_irrcache.io.mitsuba_vol import read_vol
 
 VIEWS, UNSEEN = 8, 2
