@@ -93,7 +93,14 @@ AMONG_SURFACES = {
 }
 
 
-@pytest.mark.parametrize(("build", "depth", "bounds"), AMONG_SURFACES.values(), ids=AMONG_SURFACES)
+# Among the others, one has the lamps, one has all orders.
+@pytest.mark.parametrize(
+    ("build", "depth", "bounds"),
+    [
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name == "lamps"))
+        for name, case in AMONG_SURFACES.items()
+    ],
+)
 def test_with_surfaces(scenes, build, depth, bounds):
     """``sweep`` agrees with volpath if the ground and another medium scatter radiance back."""
     depths, ours = {"max_depth": depth, "rr_depth": 50}, {"cache_spp": 128, "solver": "sweep"}

@@ -118,7 +118,8 @@ def test_against_the_light(kind, angle, depth, g, albedo, tint):
 
 @pytest.mark.parametrize(
     ("kind", "objects"),
-    [("sun", 0), ("lamp", 0), ("point", 1)],
+    # `test_against_the_light` has the lamp, too.
+    [("sun", 0), pytest.param("lamp", 0, marks=pytest.mark.slow), ("point", 1)],
     ids=["sun", "lamp", "point, gloss"],
 )
 def test_shadows(kind, objects):

@@ -125,7 +125,14 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize(("build", "options"), SCENES.values(), ids=SCENES)
+# The closed room takes most of a minute; `test_surfaces_among_voxels` has closed rooms with nodes.
+@pytest.mark.parametrize(
+    ("build", "options"),
+    [
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name == "room"))
+        for name, case in SCENES.items()
+    ],
+)
 def test_nodes_do_not_bias_the_image(scenes, build, options):
     """Blocks of 6 x 6 pixels agree with those of paths that end in media only."""
     scene = scene_of(scenes, build())

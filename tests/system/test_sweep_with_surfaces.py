@@ -141,7 +141,14 @@ def blocks(image: np.ndarray) -> np.ndarray:
     return image.reshape(n, BLOCK, n, BLOCK, -1).mean(axis=(1, 3))
 
 
-@pytest.mark.parametrize(("build", "max_depth", "spp"), SCENES.values(), ids=SCENES)
+# The closed room takes a minute. `test_small_and_large_emitters_agree_with_path` has it, too.
+@pytest.mark.parametrize(
+    ("build", "max_depth", "spp"),
+    [
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name == "room"))
+        for name, case in SCENES.items()
+    ],
+)
 def test_volpath(scenes, build, max_depth, spp):
     """A cloud, its shadow, and the radiance that the ground reflects to it agree with volpath.
 
