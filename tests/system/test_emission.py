@@ -174,14 +174,14 @@ def glowing(bsdf: dict, radiance: float, center, radius: float = 0.5) -> dict:
     return ball | {"bsdf": bsdf, "emitter": emitter}
 
 
-@pytest.mark.parametrize("phase", [{"type": "isotropic"}, {"type": "hg", "g": 0.6}])
-def test_equilibrium_by_sweep_with_surfaces(scenes, phase):
-    """``sweep`` preserves equilibrium with two media and a grey sphere outside of both.
+def test_equilibrium_by_sweep_with_surfaces(scenes):
+    """``sweep`` preserves equilibrium with two media, one of which scatters anisotropically, and a
+    grey sphere outside of both.
 
     The sphere emits what it does not reflect.
     """
     place, beside = scenes.placement(), scenes.placement((0.8, 1, 1), center=(2.0, 0, 0))
-    fog = scenes.medium(1.5, 0.6) | {"phase": phase}
+    fog = scenes.medium(1.5, 0.6) | {"phase": {"type": "hg", "g": 0.6}}
     objects = {
         "beside": scenes.boundary(scenes.medium(1.5, 0.6), beside),
         "ball": glowing({"type": "diffuse", "reflectance": 0.5}, 0.5, (-0.9, 1.8, -0.5)),
@@ -196,8 +196,7 @@ def test_equilibrium_by_sweep_with_surfaces(scenes, phase):
     assert np.abs(found - 1).max() < 0.05
 
 
-@pytest.mark.parametrize(("max_depth", "samples"), [(2, 512), (-1, 64)])
-def test_emission_in_a_room(scenes, max_depth, samples):
+def test_emission_in_a_room(scenes):
     """``sweep`` agrees with ``path`` on emission that reaches a medium by walls and another
     medium.
 
@@ -209,8 +208,8 @@ def test_emission_in_a_room(scenes, max_depth, samples):
     post = glowing({"type": "diffuse"}, 0.2, (1.1, 0.3, 0), 0.08)
     shape, light = flame(scenes)
     objects, found = {"wall": wall, "beside": beside, "post": post}, []
-    for solver, spp in (("auto", 256), ("path", samples)):
-        settings = {"solver": solver, "cache_spp": spp, "resolution": 16, "max_depth": max_depth}
+    for solver, spp in (("auto", 256), ("path", 64)):
+        settings = {"solver": solver, "cache_spp": spp, "resolution": 16}
         integrator = {"type": "irrcache", "emission": light, "emission_scale": 2.0} | settings
         scene = scenes.load(integrator, shape, 4, **DARK, **objects, default_solver="path")
         scene.integrator().prepare(scene)
