@@ -36,6 +36,9 @@ GROWTH = 1.25
 TARGET_ERROR = 0.005
 #: Seconds between two checks for moved cameras while the solver runs.
 CHECK_SECONDS = 0.02
+#: Seconds for which another edit waits for the first image of an edit. Otherwise no image would
+#: appear while a slider or the sun is dragged, which makes an edit before the last one is shown.
+EDIT_SECONDS = 0.5
 #: (width, height) of an image that is displayed until windows have cameras of their own. It is
 #: wider than most windows; they crop it.
 FIRST_LOOK = (480, 240)
@@ -75,6 +78,7 @@ class Session:
         self._shown: Light | None = None  # displayed; the previous caches until new ones exist
         self._shown_samples = 0
         self._holds_previous = False  # whether windows may still hold the previous caches
+        self._edited = -np.inf  # time of the last edit
         self._revision = 0  # number of the displayed state, counted across edits
         self._checked = 0.0
         # tasks while no camera moves, in turn
@@ -203,6 +207,8 @@ class Session:
                 # Read before the step: a camera may come to rest during it.
                 rest = self._until_rest
                 if not self._step():
+                    if self._tasks and rest is None:
+                        rest = CHECK_SECONDS  # they wait for an image
                     with self._news:
                         if not (self._is_called or self._closed or self._is_work_waiting):
                             self._news.wait(rest)
@@ -248,12 +254,19 @@ class Session:
         except Exception as error:
             self.document.restore(before)
             raise IrrcacheError(original_message(error)) from error
-        self._light = light
+        self._light, self._edited = light, monotonic()
 
     @property
     def _is_called(self) -> bool:
-        """Return whether a task waits for the thread, or the thread has to end."""
-        return bool(self._tasks) or self._stopped
+        """Return whether a task may be done, or the thread has to end."""
+        return (bool(self._tasks) and not self._owes_image) or self._stopped
+
+    @property
+    def _owes_image(self) -> bool:
+        """Return whether the last edit is to be displayed before other tasks."""
+        if self._reserved or monotonic() - self._edited > EDIT_SECONDS:
+            return False
+        return self.has_edit or any(w.outdated for w in self._windows)
 
     @property
     def _is_work_waiting(self) -> bool:
@@ -273,7 +286,7 @@ class Session:
         """Do the most urgent work; return whether there was any."""
         while self._closed:
             self._closed.pop().forget()
-        while self._tasks:
+        while self._tasks and self._is_called:
             self._tasks.popleft()()
         if self._show_coarse():
             return True
@@ -281,12 +294,12 @@ class Session:
             self._release_previous()
         if any(w.is_moving for w in self._windows):
             return False
+        if self.has_edit and not self._reserved:
+            return self._improve()  # an edit is displayed only after its first refinement
         if self._show_resting(first=True):
             return True
         if self._reserved:
             return False
-        if self.has_edit:
-            return self._improve()  # an edit is displayed only after its first refinement
         for _ in range(len(self._chores)):
             self._chores.rotate()
             if self._chores[0]():
@@ -322,7 +335,10 @@ class Session:
         if other or not light.samples or light.samples >= GROWTH * self._shown_samples:
             self._revision += 1
             self._shown, self._shown_samples = light, light.samples
-            self._holds_previous |= other
+            if other:
+                self._holds_previous = True
+                for window in list(self._windows):
+                    window.expect(light)
         elif not self._wants_light:
             self._revision += 1
         self._publish_status()

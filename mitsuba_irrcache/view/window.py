@@ -114,10 +114,14 @@ class Window:
         self.samples = self._light = self._comparison = None
         self.outdated = False
 
+    def expect(self, light: Light) -> None:
+        """Note that images of caches other than ``light`` are outdated."""
+        if self._light is not light:
+            self.outdated = self.view is not None
+
     def release_others(self, light: Light) -> None:
         """Release images of caches other than ``light``."""
         if self._light is not light:
-            self.outdated = self.view is not None
             self.samples = self._light = None
         if self._comparison is not None and self._comparison.light is not light:
             self._comparison = None

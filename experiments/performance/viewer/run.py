@@ -148,12 +148,17 @@ def turning_the_sun(window: Window, repeats: int) -> dict[str, float]:
     sphere = window.page.locator("irrcache-light canvas")
     if not sphere.count():
         return {}
-    found = []
+    sphere.scroll_into_view_if_needed()
+    found, place, mouse = [], sphere.bounding_box(), window.page.mouse
     for number in range(repeats):
+        window.wait_for("^final", 60)
+        time.sleep(1)  # the note of the previous image may be older than the last turn
         window.wait_for("^final", 60)  # no other image is displayed from now on
         shown = len(window.shown())
+        mouse.move(place["x"] + 45 - 6 * number, place["y"] + 20 + 4 * number)
         began = time.time()
-        sphere.click(position={"x": 45 - 6 * number, "y": 20 + 4 * number})
+        mouse.down()
+        mouse.up()
         window.wait_for_picture(shown)
         found.append(_seen(window, shown, began) - began)
     return {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import threading
 import time
 import weakref
 from dataclasses import replace
@@ -230,6 +231,30 @@ def test_an_edit_is_displayed_coarsely_first(session):
     first, *others = screen.pictures[count:]
     assert first.moving and first.pixels.size < others[-1].pixels.size
     assert not any(p.moving for p in others)
+
+
+def test_each_edit_is_displayed_while_others_wait(session, monkeypatch):
+    """While the sun is dragged, an edit always waits; nevertheless each one is displayed, coarsely.
+
+    When a waiting edit interrupted the solver, no image appeared before the end of the drag.
+    """
+    monkeypatch.setattr(sessions, "EDIT_SECONDS", PATIENCE)
+    screen = Screen()
+    window = session.open(screen.show)
+    session.look(window, View(front(session), SIZE))
+    screen.wait(final)
+    count, done = len(screen.pictures), threading.Semaphore(0)
+
+    def edit(density: float) -> None:
+        session.edit(lambda document: document.set_density(density))
+        done.release()
+
+    for number in range(8):  # two edits wait at any time
+        if number >= 2:
+            assert done.acquire(timeout=PATIENCE)
+        threading.Thread(target=edit, args=(1 + 0.1 * number,), daemon=True).start()
+    screen.wait(lambda p: len(screen.pictures) > count + 8 and p.final)
+    assert sum(p.moving for p in screen.pictures[count:]) == 8
 
 
 def test_edits_display_no_black_images(session):
