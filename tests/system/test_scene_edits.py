@@ -118,7 +118,6 @@ def worlds(scenes) -> dict[str, dict]:
 WORLDS = ("lights", "envmap", "sunsky", "phases", "table", "ball", "surfaces")
 #: Rendered by `sweep` with single scattering, which is faster.
 SWEPT_ONCE = ("lights", "envmap", "sunsky", "phases", "table", "surfaces")
-SOLVERS = ("sweep", "path")
 
 
 def settings(solver: str, **others) -> dict:
@@ -207,19 +206,18 @@ def own_keys(scenes, world: str, solver: str) -> list[str]:
     return [key for key, kind in kinds.items() if kind not in known]
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("world", WORLDS)
-def test_every_assigned_parameter_changes_the_image(scenes, world, solver):
+def test_every_assigned_parameter_changes_the_image(scenes, world):
     """Every assigned parameter changes the image, and its previous value restores it.
 
     Parameters are changed one by one and all at once. Each image equals, bit by bit, that of an
     integrator that has not rendered before; the last one also equals that of a newly loaded scene.
     """
-    scene = loaded(scenes, world, solver)
+    scene = loaded(scenes, world, "path")
     builder = scene.integrator()._builder
     params, old = mi.traverse(scene), image(scene)
     first, given = old, {}
-    for key in own_keys(scenes, world, solver):
+    for key in own_keys(scenes, world, "path"):
         original, plugin = plain(params[key]), params.properties[key][2]
         for factor in FACTORS:
             assign(params, key, edited(original, factor, plugin))
@@ -235,16 +233,33 @@ def test_every_assigned_parameter_changes_the_image(scenes, world, solver):
             assert builder.revision == revision, "a cache was made for nothing"
         first, given[key] = old, edited(original, FACTORS[0], plugin)
 
-    def edited_image(scene: mi.Scene) -> np.ndarray:
-        params = mi.traverse(scene)
-        for key, value in given.items():
-            assign(params, key, value)
-        params.update()
-        return image(scene)
-
-    found = edited_image(scene)
+    found = edited_image(scene, given)
     del scene, builder, params, plugin  # kernels differ where there are two scenes
-    np.testing.assert_array_equal(found, edited_image(loaded(scenes, world, solver)))
+    np.testing.assert_array_equal(found, edited_image(loaded(scenes, world, "path"), given))
+
+
+def edited_image(scene: mi.Scene, values: dict) -> np.ndarray:
+    """Assign ``values`` to parameters and render."""
+    params = mi.traverse(scene)
+    for key, value in values.items():
+        assign(params, key, value)
+    params.update()
+    return image(scene)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_parameters_assigned_together_change_the_image_by_sweep(scenes, world):
+    """Edits are found in the same way whatever the solver; what follows from them depends on it."""
+    scene = loaded(scenes, world, "sweep")
+    old, params, given = image(scene), mi.traverse(scene), {}
+    for key in own_keys(scenes, world, "sweep"):
+        plugin = params.properties[key][2]
+        given[key] = edited(plain(params[key]), FACTORS[0], plugin)
+    found = edited_image(scene, given)
+    assert not np.array_equal(found, old)
+    np.testing.assert_array_equal(found, image_without_past(scene))
+    del scene, params, plugin  # kernels differ where there are two scenes
+    np.testing.assert_array_equal(found, edited_image(loaded(scenes, world, "sweep"), given))
 
 
 @pytest.mark.parametrize("world", WORLDS)
