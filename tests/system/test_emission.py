@@ -196,6 +196,8 @@ def test_equilibrium_by_sweep_with_surfaces(scenes):
     assert np.abs(found - 1).max() < 0.05
 
 
+# The equilibrium above has emission, a surface and two media, too.
+@pytest.mark.slow
 def test_emission_in_a_room(scenes):
     """``sweep`` agrees with ``path`` on emission that reaches a medium by walls and another
     medium.
