@@ -24,7 +24,7 @@ def transmittance(p: np.ndarray) -> np.ndarray:
     """Integrate the mean transmittance between positions (n, 3) in the cube [-1, 1]^3 and the
     emitter, weighted by solid angle.
     """
-    at = (np.arange(800) + 0.5) / 800 * 2 * HALF_WIDTH - HALF_WIDTH
+    at = (np.arange(400) + 0.5) / 400 * 2 * HALF_WIDTH - HALF_WIDTH
     x, z = (c.ravel() for c in np.meshgrid(at, at))
     result = []
     for point in p:
