@@ -34,7 +34,7 @@ def irradiance_field(
     means = _interpolated_means(sums, interpolation)
     known, roots = marked(grid, active), [dr.sqrt(m) for m in means]
     variance = share = None
-    if not sums.is_correlated:  # errors shared by neighbours do not bias interpolation
+    if sums.has_own_errors:  # those shared by neighbours do not bias interpolation
         noise = [sums.relative_variance(m, c) for c, m in enumerate(means)]
         mean = on_grid(grid, active, [sum(noise) / len(noise)]).array
         share = share_of_noise(grid, mean, known)
@@ -47,7 +47,7 @@ def irradiance_field(
         smooth = dr.rsqrt(falloff.of_voxels(active))
         roots = [r * smooth for r in roots]
     values = on_grid(grid, active, roots).array
-    if not sums.is_correlated:
+    if sums.has_own_errors:
         variance = on_grid(grid, active, noise[:channels]).array
     separated = None if classes is None else classes.separated
     values = conserving(grid, values, known, channels, share, separated)

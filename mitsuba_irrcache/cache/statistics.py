@@ -38,6 +38,8 @@ class BatchSums(Immutable):
         spreads: for each channel, the sum of squared deviations of the batches' irradiance (of
             all orders) from its mean.
         moments: sums of batch means for each angular moment and channel, float32.
+        own_spread: if `is_correlated`, the sum of the variances of those parts of the batches' mean
+            irradiance (of all channels) that are sampled for each voxel alone, float32.
 
     An array that is None stands for 0.
     """
@@ -53,6 +55,7 @@ class BatchSums(Immutable):
         self.totals: list = [None] * (len(ORDER_GROUPS) * channels)
         self.spreads: list = [None] * channels
         self.moments: list = [None] * (moments * channels)
+        self.own_spread: mi.Float | None = None
 
     def _with(self, **changes: Any) -> BatchSums:
         """Return a copy with other attributes."""
@@ -89,9 +92,20 @@ class BatchSums(Immutable):
         n, spread = self._batch_count, self.spreads[channel]
         return self.zeros if spread is None else spread / (n * (n - 1))
 
+    @property
+    def has_own_errors(self) -> bool:
+        """Whether errors differ between neighbouring voxels."""
+        return not self.is_correlated or self.own_spread is not None
+
     def relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
-        """Return `variance` over the squared ``mean`` per voxel, at most 1; 0 if unknown."""
-        variance = self.variance(channel)
+        """Return the variance of each voxel that is independent of its neighbours, over the squared
+        ``mean``, at most 1; 0 if unknown.
+        """
+        if self.is_correlated:
+            n, spread = self._batch_count, self.own_spread
+            variance = None if spread is None else spread / dr.square(n)
+        else:
+            variance = self.variance(channel)
         if variance is None:
             return dr.zeros(mi.Float, dr.width(mean))
         # Do not divide squares: they underflow for values below 1e-19.
@@ -110,10 +124,12 @@ class BatchSums(Immutable):
 
     # ------------------------------------------------------------------ more samples
 
-    def with_blocks(self, seed: int, samples: int, blocks: list[tuple]) -> BatchSums:
+    def with_blocks(
+        self, seed: int, samples: int, blocks: list[tuple], own_spread: mi.Float | None = None
+    ) -> BatchSums:
         """Return sums with ``samples`` more per voxel from the stream ``seed``, evaluated.
 
-        See `IrradianceCache.add` for the ``blocks``.
+        See `IrradianceCache.add` for the ``blocks`` and ``own_spread``.
         """
         totals, spreads, *moments = (
             [concatenated(part) for part in zip(*parts, strict=True)]
@@ -121,13 +137,13 @@ class BatchSums(Immutable):
         )
         merged = self._merged(totals, spreads, samples // self.batch)
         moments = totals_of_pairs(self.moments, *moments) if moments else self.moments
-        return self._evaluated(merged, moments, {seed: samples})
+        return self._evaluated(merged, moments, own_spread, {seed: samples})
 
     def with_sums(self, other: BatchSums) -> BatchSums:
         """Return sums with all samples of ``other`` added, evaluated."""
         merged = self._merged(other.totals, other.spreads, other.samples // other.batch)
         moments = totals_of_pairs(self.moments, other.moments)
-        return self._evaluated(merged, moments, other.streams)
+        return self._evaluated(merged, moments, other.own_spread, other.streams)
 
     def with_count(self, seed: int, samples: int) -> BatchSums:
         """Return sums that count samples whose contribution has been added already or is zero."""
@@ -140,14 +156,32 @@ class BatchSums(Immutable):
         )
 
     def filled(
-        self, streams: dict[int, int], totals: list, spreads: list, moments: list
+        self,
+        streams: dict[int, int],
+        totals: list,
+        spreads: list,
+        moments: list,
+        own_spread: mi.Float | None = None,
     ) -> BatchSums:
         """Return sums at the same voxels with these values."""
-        return self._with(streams=streams, totals=totals, spreads=spreads, moments=moments)
+        return self._with(
+            streams=streams,
+            totals=totals,
+            spreads=spreads,
+            moments=moments,
+            own_spread=own_spread,
+        )
 
-    def _evaluated(self, merged: tuple[list, list], moments: list, streams: dict) -> BatchSums:
-        dr.eval(merged, moments)
-        return self.filled(self._counted(streams), *merged, moments)
+    def _evaluated(
+        self,
+        merged: tuple[list, list],
+        moments: list,
+        own_spread: mi.Float | None,
+        streams: dict,
+    ) -> BatchSums:
+        own_spread = total([self.own_spread, own_spread])
+        dr.eval(merged, moments, own_spread)
+        return self.filled(self._counted(streams), *merged, moments, own_spread)
 
     def _counted(self, streams: dict[int, int]) -> dict[int, int]:
         more = {seed: self.streams.get(seed, 0) + n for seed, n in streams.items()}
@@ -191,7 +225,8 @@ def totals_of_pairs(first: list, second: list) -> list:
 def root_correction(variance: mi.Float) -> mi.Float:
     """Return the factor that removes the bias of interpolated square roots of noisy values.
 
-    With the mean mu and the relative ``variance`` v of the voxels x_i, and trilinear weights w_i,
+    Valid for errors that are independent between voxels. With the mean mu and the relative
+    ``variance`` v of the voxels x_i, and trilinear weights w_i,
     E[(sum w_i sqrt(x_i))^2] = mu (1 - (1 - sum w_i^2) v / 4) to first order, and the mean of
     sum w_i^2 over a cell is (2/3)^3. Without the correction, 16 samples yield an irradiance that is
     about 1 % too small.

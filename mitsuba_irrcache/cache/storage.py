@@ -65,6 +65,7 @@ def write_cache(path: str | Path, stored: StoredCache) -> None:
         "totals": plain(sums.totals),
         "spreads": plain(sums.spreads),
         **({"moments": plain(sums.moments, np.float32)} if moments else {}),
+        **({"own_spread": plain([sums.own_spread])} if sums.own_spread is not None else {}),
     }
     description["values"] = digest_of_arrays(arrays)
     description["digest"] = digest_of_description(description)
@@ -114,13 +115,17 @@ def _restored(description: dict, arrays: dict[str, np.ndarray]) -> StoredCache:
     moments = arrays["moments"] if count else np.zeros((0, width), np.float32)
     _check_sums(totals, spreads, (channels, width), np.float32 if correlated else np.float64)
     _check_moments(moments, (count * channels, width))
-    _check_values(totals, spreads, moments)
+    own_spread = arrays.get("own_spread", np.zeros((1, width), np.float32))
+    if (own_spread.shape, own_spread.dtype) != ((1, width), np.float32):
+        raise ValueError(f"own_spread of shape {own_spread.shape} and type {own_spread.dtype}")
+    _check_values((totals, spreads, own_spread), moments)
     streams, batch = samples_by_seed(description), int(description["batch"])
     smallest, largest = (1, MAX_BATCH) if correlated else (BATCH, BATCH)
     if not smallest <= batch <= largest or any(n % batch for n in streams.values()):
         raise ValueError(f"samples {streams} in batches of {batch}")
     batches = sum(streams.values()) // batch
-    if (batches < 1 and totals.any()) or (batches < 2 and spreads.any()):
+    any_sums = totals.any() or own_spread.any()
+    if (batches < 1 and any_sums) or (batches < 2 and spreads.any()):
         raise ValueError(f"non-zero sums, but only {batches} batches of samples")
     check_digest(description)
     if digest_of_arrays(arrays) != description["values"]:
@@ -132,6 +137,7 @@ def _restored(description: dict, arrays: dict[str, np.ndarray]) -> StoredCache:
             _known(values, kind)
             for values, kind in ((totals, sums.real), (spreads, sums.real), (moments, mi.Float))
         ),
+        *_known(own_spread, mi.Float),
     )
     max_depth, fingerprint = int(description["max_depth"]), dict(description["fingerprint"])
     return StoredCache(grid, mi.UInt32(active), max_depth, fingerprint, sums)
@@ -165,11 +171,11 @@ def _check_moments(moments: np.ndarray, shape: tuple[int, int]) -> None:
         raise ValueError(f"moments of shape {moments.shape} and type {moments.dtype}")
 
 
-def _check_values(totals: np.ndarray, spreads: np.ndarray, moments: np.ndarray) -> None:
-    largest = np.max([np.abs(v).max(initial=0) for v in (totals, spreads, moments)])
+def _check_values(sums: tuple[np.ndarray, ...], moments: np.ndarray) -> None:
+    largest = np.max([np.abs(v).max(initial=0) for v in (*sums, moments)])
     if not largest < float(np.finfo(np.float32).max):  # NaN too
         raise ValueError("it contains values that are not finite")
-    if min(values.min(initial=0) for values in (totals, spreads)) < 0:
+    if min(values.min(initial=0) for values in sums) < 0:
         raise ValueError("it contains negative values")
 
 
@@ -221,5 +227,5 @@ def read_arrays(path: Path, names: tuple[str, ...] = ARRAYS) -> dict[str, np.nda
             raise ValueError("it is compressed")
     with np.load(path, allow_pickle=False) as archive:
         if names:
-            names = (*names, *({"moments"} & set(archive.files)))
+            names = (*names, *sorted({"moments", "own_spread"} & set(archive.files)))
         return {name: archive[name] for name in ("description", *names)}

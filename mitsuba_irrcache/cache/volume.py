@@ -246,16 +246,23 @@ class IrradianceCache:
     # ------------------------------------------------------------------ growing
 
     @_consistent
-    def add(self, seed: int, samples: int, blocks: list[tuple]) -> None:
+    def add(
+        self,
+        seed: int,
+        samples: int,
+        blocks: list[tuple],
+        own_spread: mi.Float | None = None,
+    ) -> None:
         """Add ``samples`` per voxel of the stream ``seed``.
 
         ``blocks`` cover the active voxels in turn. Each is a tuple of lists of arrays: the sums of
         batch means for each order group and channel; for each channel, the sum of squared
         deviations of the batches' irradiance from its mean; and, for anisotropic scattering, the
         sums of batch means for each moment and channel. None, in all blocks, represents 0.
+        ``own_spread`` is that of `BatchSums`.
         """
         # One assignment: an interrupt cannot leave inconsistent sums.
-        self._sums = self._sums.with_blocks(seed, samples, blocks)
+        self._sums = self._sums.with_blocks(seed, samples, blocks, own_spread)
 
     @_consistent
     def note_samples(self, seed: int, samples: int) -> None:

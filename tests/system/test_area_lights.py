@@ -204,6 +204,51 @@ def test_occluded_emitter(scenes):
     assert np.abs(blocks).max() < 0.02
 
 
+#: A square of edges 2 in the plane z = 0, as four triangles.
+FAN = """v -1 -1 0
+v 1 -1 0
+v 1 1 0
+v -1 1 0
+v 0 0 0
+f 1 2 5
+f 2 3 5
+f 3 4 5
+f 4 1 5
+"""
+
+
+@pytest.mark.usefixtures("mono")
+@pytest.mark.parametrize("max_depth", [2, -1])
+def test_sampled_emitters_have_the_mean_of_the_closed_form(tmp_path, max_depth):
+    """A far lamp that is a mesh of any shape, sampled from each voxel, is as bright as the same
+    lamp in closed form.
+
+    When the variance between neighbouring voxels was neglected, the mean was 1 to 3 % too large,
+    for any seed.
+    """
+    (tmp_path / "fan.obj").write_text(FAN)
+    look = mi.ScalarTransform4f().look_at([3, 3.5, -1], [0, 0, 0], [0, 1, 0]).scale(0.7)
+    emitter = {"type": "area", "radiance": 10.0}
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    camera = mi.ScalarTransform4f().look_at([2.6, 2.2, 5], [0, 0, 0], [0, 1, 0])
+    integrator = {"type": "irrcache", "solver": "sweep", "resolution": 24, "hide_emitters": True}
+    means = []
+    for shape in ({"type": "rectangle"}, {"type": "obj", "filename": str(tmp_path / "fan.obj")}):
+        scene = {
+            "type": "scene",
+            "integrator": integrator | {"max_depth": max_depth},
+            "sensor": {"type": "perspective", "fov": 35, "to_world": camera, "film": film},
+            "cube": {
+                "type": "cube",
+                "bsdf": {"type": "null"},
+                "interior": {"type": "homogeneous", "sigma_t": 0.25, "albedo": 0.9},
+            },
+            "lamp": shape | {"to_world": look, "emitter": emitter},
+        }
+        means.append(np.array(mi.render(mi.load_dict(scene), spp=256)).mean())
+    assert means[1] == pytest.approx(means[0], rel=0.004)
+
+
 @pytest.mark.usefixtures("mono")
 def test_all_orders_do_not_depend_on_the_solver(scenes):
     """Both solvers scatter the same irradiance further."""

@@ -29,9 +29,9 @@ from mitsuba_irrcache.transport.tracking import medium_transmittance
 LARGE_SOLID_ANGLE = 2.0
 #: Number of pairs of a point in the voxels' box and one on the emitter for this estimate.
 POINTS = 1024
-#: Number of points on all area emitters sampled from each voxel in a batch, and the maximum number
+#: Number of points on all area emitters in an estimate for each voxel, and the maximum number
 #: if there are more emitters, each of which gets one point.
-SAMPLES, MOST_SAMPLES = 4, 16
+SAMPLES, MOST_SAMPLES = 16, 32
 
 
 def is_area_emitter(emitter: mi.Emitter) -> bool:
@@ -91,21 +91,25 @@ class EmitterSampling:
             for i, emitter in enumerate(pointers):
                 dr.scatter(self._emitters, emitter, mi.UInt32(i))
             dr.eval(self._emitters)
-        self._from_points = [self._from(light) for light in point_lights]
+        #: the irradiance from each point-like emitter
+        self.from_points = [self._from(light) for light in point_lights]
 
-    def irradiance(self, seed: tuple[int, int]) -> list[list[mi.Spectrum]]:
-        """Return a list: the irradiance from each point-like emitter, [irradiance]; then an
-        unbiased estimate for all small area emitters, [irradiance, *moments].
+    @property
+    def has_area_emitters(self) -> bool:
+        """Whether there are small area emitters."""
+        return self._small > 0
+
+    def from_area_emitters(self, seed: tuple[int, int]) -> list[mi.Spectrum]:
+        """Return an unbiased estimate for all small area emitters: the irradiance, then its
+        moments.
         """
-        if not self._small:
-            return self._from_points
         samples = min(max(SAMPLES, self._small), MOST_SAMPLES)
         lane = dr.arange(mi.UInt32, dr.width(self.p))
         rng = random_stream(mi.sample_tea_32(lane, hashed_seed(seed)[1]))
         count, samples = (dr.opaque(mi.UInt32, n) for n in (self._small, samples))
         found = _mean_irradiance(self, self._emitters, count, samples, rng)
         dr.eval(found)
-        return [*self._from_points, found]
+        return found
 
     def sample(
         self, emitter: mi.EmitterPtr, sample: mi.Point2f, rng: mi.PCG32
@@ -127,11 +131,11 @@ class EmitterSampling:
         passed *= medium_transmittance(medium, mi.Ray3f(p, record.d), record.dist, visible)
         return dr.select(visible, irradiance * passed, 0), record.d, rng
 
-    def _from(self, emitter: mi.Emitter) -> list[mi.Spectrum]:
+    def _from(self, emitter: mi.Emitter) -> mi.Spectrum:
         """Compute the irradiance from a point-like emitter."""
         irradiance, *_ = self.sample(emitter, mi.Point2f(0.5), mi.PCG32(dr.width(self.p)))
         dr.eval(irradiance)
-        return [irradiance]
+        return irradiance
 
 
 @symbolic

@@ -20,9 +20,9 @@ from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import Surfa
 from mitsuba_irrcache.transport.path import flags_of
 from mitsuba_irrcache.transport.path_tracer import PathStart
 
-#: Number of paths of a batch for all voxels together; its minimum and maximum per voxel; maximum
-#: number of paths of a launch.
-PATHS, FEWEST, MOST, LANES = 1 << 24, 16, 1024, 1 << 21
+#: Number of paths of an estimate for all voxels together; its minimum and maximum per voxel;
+#: maximum number of paths of a launch.
+PATHS, FEWEST, MOST, LANES = 1 << 23, 8, 512, 1 << 21
 #: Weight of positions outside of the medium, which are moved to its boundary.
 OUTSIDE = 1e-4
 #: Offset of the random streams of these paths.

@@ -137,6 +137,8 @@ class Sweep:
         #: they follow from the direction
         self._direct: list[list[mi.Spectrum]] = []
         self._emission: list[list[mi.Spectrum]] = []
+        #: sum of the variances of what is sampled voxel by voxel in a batch; None: nothing
+        self._own_spread: mi.Float | None = None
         #: irradiance of suns that are direct lights of the cache
         self._sun_irradiance: list[mi.Spectrum] = []
         #: factors of the channels of a batch's results
@@ -227,7 +229,8 @@ class Sweep:
             return
         first, count = cache.streams.get(self.seed, 0) // cache.batch, samples // cache.batch
         for number in range(first, first + count):
-            cache.add(self.seed, cache.batch, [self._batch(number)])
+            batch = self._batch(number)
+            cache.add(self.seed, cache.batch, [batch], self._own_spread)
             if progress is not None:
                 dr.sync_thread()
                 done = (number - first + 1) * cache.batch
@@ -242,9 +245,14 @@ class Sweep:
         moments if any.
         """
         cache, seed = self.cache, (self.seed, number)
+        self._own_spread = None
         if self._medium.emission is not None:
-            arguments = self._medium, self._sample_points, cache.batch
-            self._emission = [emission_irradiance(*arguments, seed, cache.directional)]
+            arguments = self._medium, self._sample_points, cache.batch // 2
+            self._emission = [
+                self._mean_of_two(
+                    seed, lambda own: emission_irradiance(*arguments, own, cache.directional)
+                )
+            ]
         sets, grey, colour = self._ordinate_sets(seed)
         found = []
         for channels in self._channel_groups(grey):
@@ -286,12 +294,36 @@ class Sweep:
             return sets, grey_media and ordinates[0].incoming.shape[-1] == 1, colour
         surroundings = self._boundary, self._illumination, self._tracks[0]
         sets, spectra = boundary_ordinate_sets(*surroundings, passes, pairs, rng, seed)
-        self._direct = self._with_closed_form_lights(self._emitter_sampling.irradiance(seed))
+        sampling = self._emitter_sampling
+        direct = [[irradiance] for irradiance in sampling.from_points]
+        if sampling.has_area_emitters:
+            direct.append(self._mean_of_two(seed, sampling.from_area_emitters))
+        self._direct = self._with_closed_form_lights(direct)
         if not self._boundary.carries_refracted:
-            arguments = self._boundary, cache.grid, cache.active, seed
-            self._direct.append([refracted_irradiance(*arguments)])
+            arguments = self._boundary, cache.grid, cache.active
+            self._direct.append(
+                self._mean_of_two(seed, lambda own: [refracted_irradiance(*arguments, own)])
+            )
         grey = grey_media and is_grey([*spectra, *chain(*self._direct, *self._emission)])
         return sets, grey, np.ones(cache.channels)
+
+    def _mean_of_two(
+        self, seed: tuple[int, int], estimate: Callable[[tuple[int, int]], list[mi.Spectrum]]
+    ) -> list[mi.Spectrum]:
+        """Return the mean of two independent estimates, given a seed, of an irradiance at each
+        voxel (with moments), and add its variance to that of the batch.
+
+        Errors that differ between neighbours bias the interpolation of the cache unless their
+        variance is known (`cache/conservative`).
+        """
+        cache_seed, number = seed
+        first, second = (estimate((cache_seed, 2 * number + half)) for half in (0, 1))
+        error = sum(a - b for a, b in zip(first[0], second[0], strict=True)) / (2 * len(first[0]))
+        variance = dr.square(error)
+        self._own_spread = variance if self._own_spread is None else self._own_spread + variance
+        mean = [0.5 * (a + b) for a, b in zip(first, second, strict=True)]
+        dr.eval(mean, self._own_spread)
+        return mean
 
     def _first_pairs(self, pairs: int) -> int:
         """Return the number of pairs of ordinates of the first pass, which computes all orders but

@@ -40,7 +40,7 @@ def test_sampled_emitters_add_up(scenes, count):
     small = [e for e in scene.emitters() if is_area_emitter(e)]
     assert len(small) == count
     centre = mi.Point3f(dr.zeros(mi.Float, 4096), 0, 0)
-    (found,) = EmitterSampling(scene, medium, small, [], centre).irradiance((1, 2))
+    found = EmitterSampling(scene, medium, small, [], centre).from_area_emitters((1, 2))
     light = np.array(found[0][0], np.float64)
     error = light.std() / np.sqrt(len(light))
     assert error < 0.02 * expected
