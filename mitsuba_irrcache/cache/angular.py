@@ -19,16 +19,13 @@ weight.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import copy
+from enum import Enum
 from itertools import count, islice
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.spectrum import interleaved
-from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.narrow_sources import Source
 from mitsuba_irrcache.media.phase import Phase
 
@@ -42,8 +39,16 @@ NEGLIGIBLE_TERM = 1e-3
 #: function are neglected for it. With 0.07, as for scattered radiance, errors next to an area
 #: emitter are up to 7 % (g = 0.58); with 0.01 they are 0.5 %.
 MAX_DIRECT_ORDER, MAX_DIRECT_TAIL = 8, 0.01
-#: Number of values per gather (a packet).
-WIDTH = 4
+
+
+class Scattering(Enum):
+    """What is scattered into a ray: all radiance; all but what a truncated forward peak scatters of
+    narrow sources; or that alone.
+    """
+
+    ALL = "all"
+    WITHOUT_PEAK = "without the forward peak"
+    PEAK = "by the forward peak"
 
 
 class AngularBasis:
@@ -293,126 +298,6 @@ def warn_of_sharp_shadows(forward: float, name: str, reason: str) -> None:
         "surfaces are too bright in their middle, by several per cent. Use volpath where they "
         "matter.",
     )
-
-
-class SourceDepths(Protocol):
-    """Optical depths of a forward peak between voxels and narrow sources, see `PeakDepths`."""
-
-    channels: int
-    extinctions: list[list[mi.Float]]
-
-    def lengths(self, p: mi.Point3f) -> list[mi.Float]:
-        """Return the length in the medium of the line from ``p`` to each source."""
-
-
-class AngularField:
-    """The factor f as a field.
-
-    ``phi`` are the values of Phi at all voxels, one array per channel; ``moments`` those of the
-    moments L_lm and E_k, all channels of each in turn.
-    """
-
-    def __init__(
-        self,
-        directional: AngularBasis,
-        grid: Grid,
-        phi: list[mi.Float],
-        moments: list[mi.Float],
-        depths: SourceDepths | None = None,
-        extinctions: list[mi.Float] | None = None,
-    ) -> None:
-        """``depths`` are the optical depths of the forward peak to the sources, with their
-        ``extinctions`` at all voxels, all channels of each source in turn. None: multiple
-        scattering into the peak is not corrected.
-        """
-        self.directional, self.grid, self.channels = directional, grid, len(phi)
-        self._depths, self._moments = depths, len(moments) // len(phi)
-        sources = len(directional.sources) if depths is not None else 0
-        rows = []
-        for c, irradiance in enumerate(phi):
-            own = moments[c :: self.channels]
-            # The interpolated mean extinction is weighted by the irradiance of the source.
-            weighted = [
-                own[k - sources] * extinctions[depths.channels * k + min(c, depths.channels - 1)]
-                for k in range(sources)
-            ]
-            rows += [irradiance, *own, *weighted]
-        self._row = len(rows) // self.channels
-        self._loads = -(-len(rows) // WIDTH)
-        rows += [mi.Float(0)] * (self._loads * WIDTH - len(rows))
-        self.data = interleaved(rows, grid.voxel_count)
-        dr.eval(self.data)
-
-    def in_basis(self, directional: AngularBasis) -> AngularField:
-        """Return a field of the same moments for another phase function."""
-        field = copy(self)
-        field.directional = directional
-        return field
-
-    def factor(
-        self,
-        p: mi.Point3f,
-        direction: mi.Vector3f,
-        basis: list[mi.Float],
-        active: mi.Bool,
-        with_peak: bool = True,
-        peak_depth: mi.Float | mi.Color3f | None = None,
-    ) -> mi.Float | mi.Color3f:
-        """Evaluate f at ``p`` for a ray along ``direction``.
-
-        ``basis`` is the result of `AngularBasis.basis`; ``with_peak`` as in `AngularBasis.gains`.
-        ``peak_depth`` is the optical depth of scattering into the forward peak between ``p`` and
-        the camera; None: multiple scattering into the peak is not corrected.
-        """
-        directional = self.directional
-        values = self._interpolated(self.grid.coordinates.point(p), active)
-        rows = [values[c * self._row : (c + 1) * self._row] for c in range(self.channels)]
-        weights = basis + directional.gains(p, direction, active, with_peak)
-        corrections = [[]] * self.channels
-        if with_peak and peak_depth is not None and self._depths is not None:
-            depths = self._depths_to_camera(p, rows, peak_depth)
-            corrections = [directional.corrections(p, direction, d) for d in depths]
-            corrections = corrections * (self.channels // len(corrections))
-        found = []
-        for (phi, *values), correction in zip(rows, corrections, strict=True):
-            moments = values[: self._moments]
-            extra = sum(w * m for w, m in zip(weights, moments, strict=True))
-            narrow = moments[len(basis) :]
-            extra += sum(w * m for w, m in zip(correction, narrow, strict=False))
-            ratio = dr.select(phi > 0, 1 + extra / dr.select(phi > 0, phi, 1), 1)
-            # A truncated series may be negative, and noisy moments are unbounded.
-            found.append(dr.clip(ratio, 0, directional.largest_ratio))
-        return found[0] if self.channels == 1 else mi.Color3f(found)
-
-    def _depths_to_camera(
-        self, p: mi.Point3f, rows: list[list[mi.Float]], peak_depth: mi.Float | mi.Color3f
-    ) -> list[list[mi.Float]]:
-        """Return the optical depths of the peak from each source via ``p`` to the camera.
-
-        One list over the sources per channel, or a single one if all channels are equal.
-        """
-        sources, found = len(self.directional.sources), []
-        before = [peak_depth] if isinstance(peak_depth, mi.Float) else list(peak_depth)
-        groups = [[row] for row in rows] if len(before) > 1 and len(rows) > 1 else [rows]
-        lengths = self._depths.lengths(p)
-        for group, depth in zip(groups, before, strict=False):
-            total = []
-            for k, length in enumerate(lengths):
-                irradiance = sum(row[1 + self._moments - sources + k] for row in group)
-                weighted = sum(row[1 + self._moments + k] for row in group)
-                mean = dr.select(irradiance > 0, weighted / irradiance, 0)
-                total.append(dr.fma(mean, length, depth))
-            found.append(total)
-        return found
-
-    def _interpolated(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
-        """Interpolate the stored values trilinearly."""
-        sums = [mi.Vector4f(0)] * self._loads
-        for voxel, weight in self.grid.corners(u):
-            for k in range(self._loads):
-                values = dr.gather(mi.Vector4f, self.data, voxel * self._loads + k, active)
-                sums[k] = dr.fma(weight, values, sums[k])
-        return [value for packet in sums for value in packet]
 
 
 def order_of_direct_light(phase: Phase) -> int:

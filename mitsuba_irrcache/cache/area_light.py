@@ -21,7 +21,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_direct_light
+from mitsuba_irrcache.cache.angular import AngularBasis, order_of_direct_light
+from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, mean_over, shift_at, spread
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream

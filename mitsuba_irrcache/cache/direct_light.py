@@ -21,7 +21,8 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_direct_light
+from mitsuba_irrcache.cache.angular import AngularBasis, Scattering, order_of_direct_light
+from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.conservative import unbiased
 from mitsuba_irrcache.cache.peak_depths import peak_depth
 from mitsuba_irrcache.core.fast_math import absorptance, clipped, maximum, minimum
@@ -455,12 +456,12 @@ class DirectLightAlongRays:
     def scattered(
         self,
         segment: RaySegment,
-        with_peak: bool = True,
+        scattering: Scattering = Scattering.ALL,
         peak_depth: mi.Float | mi.Color3f | None = None,
     ) -> mi.Spectrum:
         """Integrate the radiance scattered towards the camera along a segment.
 
-        ``with_peak`` and ``peak_depth`` are as in `AngularField.factor`.
+        ``scattering`` selects the part of it, ``peak_depth`` is as in `AngularField.factor`.
 
         The segment is divided into parts. In a part with constant extinction c and optical depth C,
         along which the optical depth to the emitter changes linearly from s0 to s0 + S,
@@ -491,7 +492,12 @@ class DirectLightAlongRays:
         absorbed = absorptance(0.5 * (near + far))
         rule = dr.select(absorbed > 0, (weights[0] + weights[1]) / absorbed, 1)
         if self._basis is not None:
-            total *= self._gain(ray(0.5 * (a + b)), ray.d, with_peak, peak_depth)
+            p = ray(0.5 * (a + b))
+            with_peak = scattering is not Scattering.WITHOUT_PEAK
+            gain = self._gain(p, ray.d, with_peak, peak_depth)
+            if scattering is Scattering.PEAK:
+                gain = gain - self._gain(p, ray.d, with_peak=False)
+            total *= gain
         return total * mi.Spectrum(rule) * dr.inv_four_pi
 
     def _parts(

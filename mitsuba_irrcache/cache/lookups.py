@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import AngularField
+from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.conservative import conserving, share_of_noise
 from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.statistics import BatchSums, root_correction

@@ -16,7 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
+from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.cache.display import as_html, as_text
 from mitsuba_irrcache.cache.interpolation import PLAIN, Interpolation

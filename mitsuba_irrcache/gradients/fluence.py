@@ -7,7 +7,8 @@ from copy import copy
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
+from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.conservative import conserving
 from mitsuba_irrcache.cache.direct_light import DirectLight, DirectLightAlongRays
 from mitsuba_irrcache.cache.volume import IrradianceCache

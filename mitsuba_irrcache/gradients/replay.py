@@ -14,7 +14,8 @@ from typing import NamedTuple, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
+from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.core.fast_math import absorptance, minimum
 from mitsuba_irrcache.core.jit import symbolic

@@ -21,7 +21,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import AngularField
+from mitsuba_irrcache.cache.angular import Scattering
+from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays, RaySegment
 from mitsuba_irrcache.cache.uncertainty import UncertaintyField
 from mitsuba_irrcache.core.fast_math import minimum
@@ -152,6 +153,7 @@ class Projection:
         view: tuple = (),
         peak: Sequence = (),
         length: mi.Float | None = None,
+        scattering: Scattering = Scattering.ALL,
     ) -> tuple:
         """Evaluate the fields at the distance ``t``.
 
@@ -162,7 +164,8 @@ class Projection:
 
         ``peak`` is the optical depth of scattering into a truncated forward peak between the camera
         and the beginning of a segment of this ``length`` that ends at ``t``, and the extinction of
-        the peak there. If it is empty, scattering into a truncated peak is excluded.
+        the peak there. If it is empty, scattering into a truncated peak is excluded. ``scattering``
+        selects the radiance that is scattered.
         """
         # docs/primer, eq. (1.3)
         p, active = fields.ray(t), mi.Bool(True)
@@ -179,10 +182,18 @@ class Projection:
             peak = [depth + 0.5 * length * extinction, sigma_t * albedo * self._peak_share]
             peak[0] += 0.5 * length * peak[1]
         if self.directional is not None:
-            with_peak = bool(peak) or not self.truncates_peak
-            depth = peak[0] if peak else None
-            phi = phi * self.directional.factor(p, *view, active, with_peak, depth)
+            phi = phi * self._angular_factor(p, view, active, peak, scattering)
         return sigma_t, albedo * phi * dr.inv_four_pi, extras, list(peak)
+
+    def _angular_factor(
+        self, p: mi.Point3f, view: tuple, active: mi.Bool, peak: Sequence, scattering: Scattering
+    ) -> mi.Float | mi.Color3f:
+        if scattering is Scattering.WITHOUT_PEAK:
+            return self.directional.sampled_factor(p, *view, active)
+        if scattering is Scattering.PEAK:
+            return self.directional.peak_factor(p, view[0], active, peak[0])
+        depth = peak[0] if peak else None
+        return self.directional.factor(p, *view, active, True, depth)
 
     def angular_terms(self, direction: mi.Vector3f) -> tuple:
         """Precompute the terms of `fetch` that depend on the direction; empty if isotropic."""
@@ -249,19 +260,19 @@ class Projection:
         offset: mi.Float,
         active: mi.Bool,
         part: MarchedPart | None = None,
-        with_peak: bool = True,
+        scattering: Scattering = Scattering.ALL,
     ):
         """March from ``near`` to ``far``, or through a ``part`` of the medium.
 
         Returns the scattered radiance, the transmittance, the sums for `Layers`, and the emitted
         radiance. ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is
-        the radiance behind the medium, required for early termination. Without ``with_peak``
-        narrow sources are not scattered into a truncated forward peak.
+        the radiance behind the medium, required for early termination. ``scattering`` selects what
+        is scattered (`Scattering.PEAK` requires `truncates_peak`).
         """
         # docs/primer, eqs. (1.1), (5.1)
-        march = _RayMarch(self, ray, (near, far), background, offset)
+        march = _RayMarch(self, ray, (near, far), background, offset, scattering)
         is_first = part is None or part.state is None
-        state = march.begin(mi.Bool(active), with_peak) if is_first else part.state
+        state = march.begin(mi.Bool(active)) if is_first else part.state
         going = march.goes_on(state, part)
         while dr.hint(going, label="ray march"):
             march.advance(state)
@@ -388,8 +399,10 @@ class _RayMarch:
         bounds: tuple[mi.Float, mi.Float],
         background: mi.Spectrum,
         offset: mi.Float,
+        scattering: Scattering,
     ) -> None:
         near, far = bounds
+        self._scattering = scattering
         self._projection, self._ray, self._near, self._far = projection, ray, near, far
         self._clearance = projection.clearance.along(ray)
         self._fields = projection.lookups.along(ray)
@@ -404,7 +417,7 @@ class _RayMarch:
         limit = dr.minimum(dr.ceil((far - near) / step) + 1, 2**24)
         self._lattice = near, far, offset, step, dr.rcp(step), limit
 
-    def begin(self, active: mi.Bool, with_peak: bool) -> _MarchState:
+    def begin(self, active: mi.Bool) -> _MarchState:
         """Return the state before the first segment.
 
         Points of the lattice are numbered from 1; number 0 is the beginning, reached by a first
@@ -422,7 +435,7 @@ class _RayMarch:
             here=here,
             previous=(here.extinction, here.source),
             previous_length=mi.Float(dr.inf),
-            peak=projection.zero_peak() if with_peak else [],
+            peak=[] if self._scattering is Scattering.WITHOUT_PEAK else projection.zero_peak(),
             means=[light.mean_extinction(self._ray(t), active) for light in lights],
             emission=mi.Spectrum(0),
             transmittance=(mi.Float if grey else mi.Color3f)(1),
@@ -444,7 +457,9 @@ class _RayMarch:
         empty, wall, skip, state.k, state.t, end = self._next_point(state)
         length = end - state.t
         self._skip_empty_space(state, skip)
-        *values, peak = projection.fetch(self._fields, end, self._view, state.peak, length)
+        *values, peak = projection.fetch(
+            self._fields, end, self._view, state.peak, length, self._scattering
+        )
         there = _FieldSample(*values)
         before = self._with_inner_sources(state, there)
         extinctions, sources = self._curved(state, before, there, length)
@@ -555,8 +570,8 @@ class _RayMarch:
             peak_depth = 0.5 * (state.peak[0] + peak[0]) if state.peak else None
             ends, means = (state.t, end), (mean, state.means[i])
             lit = RaySegment(ray, ends, part.extinctions, means, part.weights, albedos)
-            with_peak = bool(state.peak) or not projection.truncates_peak
-            state.radiance += state.transmittance * light.scattered(lit, with_peak, peak_depth)
+            scattered = light.scattered(lit, self._scattering, peak_depth)
+            state.radiance += state.transmittance * scattered
 
     def _add_emitted(self, state: _MarchState, part: _MarchedSegment, length: mi.Float) -> None:
         emission = self._projection.medium.emission

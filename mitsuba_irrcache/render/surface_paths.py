@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.cache.angular import Scattering
 from mitsuba_irrcache.cache.surface import INDIRECT_LEVELS, LEVELS, SurfaceNodes
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.lights.emitters import are_distant
@@ -217,10 +218,11 @@ class SurfacePaths:
                 entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
                 hit &= active & (pointer == projection.medium.pointer)
                 ends = ray, entry, leave, mi.Spectrum(self.brightest), offset, hit
-                smooth, transmittance, *_ = projection.march(*ends, with_peak=False)
-                if dr.hint(projection.truncates_peak, mode="scalar"):
-                    scattered, *_ = projection.march(*ends)
-                    radiance += dr.select(hit, throughput * (scattered - smooth), 0)
+                peaked = projection.truncates_peak
+                part = Scattering.PEAK if peaked else Scattering.WITHOUT_PEAK
+                scattered, transmittance, *_ = projection.march(*ends, scattering=part)
+                if dr.hint(peaked, mode="scalar"):
+                    radiance += dr.select(hit, throughput * scattered, 0)
                 throughput = dr.select(hit, throughput * transmittance, throughput)
             crosses = active & si.is_valid() & is_null(si.bsdf().flags())
             factor = si.bsdf().eval_null_transmission(si, crosses)
@@ -429,7 +431,7 @@ class _PathFollower:
                 mi.Spectrum(self._paths.brightest),
                 offset,
                 hit,
-                with_peak=not self._from_node,
+                scattering=Scattering.WITHOUT_PEAK if self._from_node else Scattering.ALL,
             )
             sums.radiance += dr.select(hit, path.throughput * (scattered + emitted), 0)
             path.throughput = dr.select(hit, path.throughput * transmittance, path.throughput)

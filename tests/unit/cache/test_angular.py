@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.errors import UnsupportedSceneError
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.narrow_sources import sources_of
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.path.estimator import contributions
@@ -116,3 +118,38 @@ def test_scattered_radiance_from_moments_and_from_directions(scenes, objects, to
         weights = directional.basis(way) + directional.gains(p, way, mi.Bool(True))
         extra = sum(float(w[0]) * m for w, m in zip(weights, moments, strict=True)) / phi
         assert 1 + extra == pytest.approx(exact, abs=tolerance * phase.peak / 2)
+
+
+@pytest.fixture
+def field_and_view(scenes) -> tuple:
+    """Random moments behind a sun and a forward peak, positions between voxels, and a direction."""
+    sun = {"type": "directional", "direction": [0.2, -1.0, 0.3]}
+    scene, rng = scene_of(scenes, hg(0.85), sun=sun), np.random.default_rng(1)
+    phase = compile_scene(scene).visible[0].phase
+    basis = AngularBasis(phase if phase.forward else phase.without_peak(), sources_of(scene)[0])
+    moments = [mi.Float(0.01 * rng.random(27, dtype=np.float32)) for _ in range(basis.count)]
+    phi = mi.Float(1 + rng.random(27, dtype=np.float32))
+    field = AngularField(basis, Grid((3, 3, 3), np.eye(4)), [phi], moments)
+    near = np.float32([[0.4], [0.55], [0.61]] + 1e-3 * rng.random((3, 100_000)))
+    direction = dr.normalize(mi.Vector3f(0.3, 0.9, -0.2))
+    return field, mi.Point3f(near), direction
+
+
+def test_moments_of_one_voxel_are_right_on_average(field_and_view):
+    field, p, direction = field_and_view
+    view = direction, field.directional.basis(direction)
+    exact = np.array(field.factor(p, *view, mi.Bool(True), with_peak=False))
+    assert 0.5 < exact.min()  # not clipped
+    sampled = np.array(field.sampled_factor(p, *view, mi.Bool(True)))
+    assert 3e-3 < sampled.std() < 0.1
+    assert abs(sampled.mean() - exact.mean()) < 4 * sampled.std() / np.sqrt(len(sampled))
+
+
+def test_forward_peak_alone_is_the_difference_that_it_makes(field_and_view):
+    field, p, direction = field_and_view
+    view, everywhere = (direction, field.directional.basis(direction)), mi.Bool(True)
+    smooth = np.array(field.factor(p, *view, everywhere, with_peak=False))
+    both = np.array(field.factor(p, *view, everywhere, with_peak=True, peak_depth=mi.Float(0.3)))
+    assert np.abs(both - smooth).min() > 1e-3
+    alone = np.array(field.peak_factor(p, direction, everywhere, mi.Float(0.3)))
+    np.testing.assert_allclose(alone, both - smooth, atol=1e-6)
