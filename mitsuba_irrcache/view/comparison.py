@@ -112,7 +112,8 @@ def described(found: Compared) -> dict:
     if found.kind == "swipe":
         captions = {"left": "irrcache", "right": found.text}
         return {"mode": "swipe", "has_image": found.reference is not None, **captions}
-    message = {"mode": found.kind, "left": f"irrcache − {found.text}"}
+    difference = f"irrcache − {found.text}" if found.limit else f"no error yet; {found.text}"
+    message = {"mode": found.kind, "left": difference}
     if found.limit:
         scale = {
             "low": f"−{100 * found.limit:g} %",

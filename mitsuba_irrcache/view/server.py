@@ -78,7 +78,7 @@ class Server:
         )
         server.gui.main_panel.dock_right()  # beside the image, which it never covers
         # Without any control viser would show its own settings.
-        self._placeholder = server.gui.add_markdown("The controls follow.")
+        self._placeholder = server.gui.add_markdown("Loading the controls ...")
         # The browser's own 3-D scene is empty and needs no lights.
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)

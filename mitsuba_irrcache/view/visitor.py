@@ -255,7 +255,7 @@ class Visitor:
     def _send_note(self, picture: Picture) -> None:
         """Send what lies over the image: a note about it, and the comparison."""
         height, width, _ = picture.pixels.shape
-        state = "moving" if picture.moving else "final" if picture.final else "at rest"
+        state = "preview" if picture.moving else "final" if picture.final else "at rest"
         samples = "1 sample" if picture.samples == 1 else f"{picture.samples} samples"
         send, key = self._channel.send, self._key
         send("wait", "", key)

@@ -230,7 +230,7 @@ class Window:
             return Picture(pixels, view, count, False, final)
         known = self._comparison_of(self._light, view)
         if known is None:
-            state = Compared(view.compared, "volpath has not begun")
+            state = Compared(view.compared, "volpath: waiting for its first sample")
             return Picture(pixels, view, count, False, False, state)
         image = self.samples.image(view.look.filtered)
         look = replace(view.look, kind="image")
