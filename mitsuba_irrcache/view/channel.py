@@ -26,6 +26,8 @@ LOG = logging.getLogger(__name__)
 PATH = "/irrcache"
 #: Largest accepted message in bytes.
 LARGEST_MESSAGE = 1 << 19
+#: Seconds without a message after which an empty one says that the viewer still responds.
+ALIVE_SECONDS = 2.0
 
 #: Called with the value of a message.
 Receiver = Callable[[object], None]
@@ -146,7 +148,10 @@ class _Link:
         """Send what waits, until the connection closes."""
         with suppress(ConnectionClosed):
             while True:
-                await self._news.wait()
+                try:
+                    await asyncio.wait_for(self._news.wait(), ALIVE_SECONDS)
+                except TimeoutError:
+                    self._waiting.setdefault("alive", "")
                 self._news.clear()
                 while self._waiting:
                     kind = next(iter(self._waiting))

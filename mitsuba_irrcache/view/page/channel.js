@@ -18,7 +18,9 @@
 
 const irrcache = (() => {
   const receivers = new Map(), newest = new Map();
-  let socket = null, key = null, closed = false, told = 0;
+  // Seconds without any message after which the page says so; the viewer sends one every two seconds.
+  const SILENCE = 8;
+  let socket = null, key = null, closed = false, told = 0, heard = 0, silent = false;
 
   function connect() {
     const address = new URL("irrcache", window.location.href);
@@ -32,6 +34,9 @@ const irrcache = (() => {
       closed = false;
     };
     socket.onmessage = (event) => {
+      heard = performance.now();
+      if (silent) deliver("connection", "");
+      silent = false;
       if (typeof event.data === "string") {
         const message = JSON.parse(event.data);
         deliver(message.kind, message.value);
@@ -96,6 +101,14 @@ const irrcache = (() => {
       introduce();
     }
   });
+
+  window.setInterval(() => {
+    if (closed || !heard) return;
+    const seconds = Math.round((performance.now() - heard) / 1000);
+    if (seconds < SILENCE) return;
+    silent = true;
+    deliver("connection", `The viewer has not responded for ${seconds} seconds.`);
+  }, 1000);
 
   connect();
   // How often the page has introduced itself: after each time, the viewer needs its size.

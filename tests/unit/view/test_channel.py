@@ -13,6 +13,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.view import channel
 from mitsuba_irrcache.view.channel import PATH
 from mitsuba_irrcache.view.server import Server
 from mitsuba_irrcache.view.transfer_panel import STEPS, History, edited
@@ -21,9 +22,11 @@ from mitsuba_irrcache.volumes.transfer import load_preset
 
 @pytest.fixture(scope="module")
 def server():
-    server = Server("127.0.0.1", 8770)
-    yield server
-    server.stop()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(channel, "ALIVE_SECONDS", 3600)
+        server = Server("127.0.0.1", 8770)
+        yield server
+        server.stop()
 
 
 def open_channel(server: Server, **options):
@@ -61,6 +64,14 @@ def test_windows_are_told_why_there_is_nothing(server):
         server.show_failure("no such file")
         assert received(connection) == {"kind": "wait", "value": "error: no such file"}
     server.show_message("")
+
+
+def test_an_idle_viewer_says_that_it_responds(server, monkeypatch):
+    """Without it, a page could not tell a viewer that waits from one that hangs."""
+    monkeypatch.setattr(channel, "ALIVE_SECONDS", 0.05)
+    with open_channel(server) as connection:
+        kinds = [json.loads(connection.recv(timeout=60))["kind"] for _ in range(4)]
+    assert kinds[-2:] == ["alive", "alive"]
 
 
 def test_messages_of_windows(server):
