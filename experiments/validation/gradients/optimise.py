@@ -34,6 +34,8 @@ from mitsuba_irrcache.gradients.fit_state import Result, Settings, View
 SPP = 1024
 #: Steps from which the CPU time of a step is estimated, and steps before them.
 PILOT, FIRST = 7, 2
+#: The table of the documents for each number of voxels along a side.
+TABLES = {32: "optimisation-32", 64: "optimisation-64"}
 #: Largest number of iterations of L-BFGS, which ends with the last budget.
 MANY = 10_000
 
@@ -95,6 +97,8 @@ def main() -> None:
     parser.add_argument("--methods", default="", help="part of the names of methods to run")
     add_document(parser)
     options = parser.parse_args()
+    if options.document and options.voxels not in TABLES:
+        parser.error(f"the documents have tables for {sorted(TABLES)} voxels, not {options.voxels}")
     begin()
     mi.set_variant("llvm_ad_mono")
     mi.set_log_level(mi.LogLevel.Error)
@@ -120,7 +124,7 @@ def main() -> None:
     table = Table("Volumes from views at equal CPU time", head, rows, note)
     print(table.as_text())
     if options.document:
-        replace_tables(options.document, {f"optimisation-{options.voxels}": table})
+        replace_tables(options.document, {TABLES[options.voxels]: table})
 
 
 def _numbers(text: str) -> tuple[float, ...]:
