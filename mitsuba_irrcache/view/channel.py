@@ -150,7 +150,7 @@ class _Link:
             while True:
                 try:
                     await asyncio.wait_for(self._news.wait(), ALIVE_SECONDS)
-                except TimeoutError:
+                except asyncio.TimeoutError:  # before Python 3.11 not the built-in one
                     self._waiting.setdefault("alive", "")
                 self._news.clear()
                 while self._waiting:
