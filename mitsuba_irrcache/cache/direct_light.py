@@ -14,7 +14,7 @@ Camera rays exclude these values and evaluate E(p) exp(-tau(p)) instead.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.conservative import unbiased
 from mitsuba_irrcache.cache.peak_depths import peak_depth
 from mitsuba_irrcache.core.fast_math import absorptance, clipped, maximum, minimum
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import concatenated, symbolic
 from mitsuba_irrcache.core.sequences import random_stream
 from mitsuba_irrcache.core.spectrum import channel_mean, scatter_channels
 from mitsuba_irrcache.grids.fields import GridField
@@ -51,6 +51,9 @@ from mitsuba_irrcache.transport.tracking import optical_depth
 POINTS, DEPTH_POINTS = 8, 3
 #: Step of the finite differences at the ends of a segment, over the length of the segment.
 TANGENT = 1 / 64
+#: Maximum number of voxels for which optical depths are computed without a pause, some tenths of a
+#: second on two processor cores.
+LARGEST_PART = 1 << 18
 
 
 class DirectLight:
@@ -64,16 +67,20 @@ class DirectLight:
         grid: Grid,
         voxels: mi.UInt32,
         classes: VoxelClasses | None = None,
+        pause: Callable[[], None] = lambda: None,
     ) -> None:
-        """Compute mean extinctions and irradiance; ``classes`` is None if there are no surfaces
-        and other media among the voxels.
+        """Compute mean extinctions and irradiance.
+
+        ``classes`` is None if there are no surfaces and other media among the voxels. ``pause`` is
+        called between kernel launches and may raise an exception.
         """
         #: order of `angular_means`
         self.order = order_of_direct_light(medium.phase)
         self._kind = kind_of(emitter)
         self.emitter, self._medium = emitter, medium
         self.distant = self._kind is EmitterKind.SUN
-        p = VoxelSamplePoints(scene, grid).of(voxels)
+        self._sample_points, self._pause = VoxelSamplePoints(scene, grid), pause
+        p = self._sample_points.of(voxels)
         self._grid, self._voxels, self._centres = grid, voxels, p
         depth, self._passed = self._attenuation(scene, p)
         #: field of the mean extinction along the line to the emitter
@@ -197,14 +204,36 @@ class DirectLight:
         """Return the optical depth of the medium, and the transmittance of surfaces and other
         media, between ``p`` and the emitter.
         """
-        ray, near, far = self._line(p)
-        depth = optical_depth(self._medium, ray, near, far, near < far, dr.inf)
+        depth = self._depths()
         passed = mi.Spectrum(1)
         if self._medium.is_traced:
             position = [dr.opaque(mi.Float, float(v)) for v in position_of(self.emitter)]
             passed = _past_others(scene, self._medium, p, mi.Point3f(position))
             dr.eval(passed)
         return depth, passed
+
+    def _depths(self) -> mi.Float | mi.Color3f:
+        """Return the optical depths between the sample points of the voxels and the emitter."""
+        count = dr.width(self._voxels)
+        if count <= LARGEST_PART:
+            return self._depths_at(self._centres)
+        parts = []
+        for start in range(0, count, LARGEST_PART):
+            self._pause()
+            index = dr.arange(mi.UInt32, min(LARGEST_PART, count - start))
+            index += dr.opaque(mi.UInt32, start)
+            voxels = dr.gather(mi.UInt32, self._voxels, index)
+            parts.append(self._depths_at(self._sample_points.of(voxels)))
+            dr.eval(parts[-1])
+            dr.sync_thread()  # launches only queue kernels, which nothing interrupts
+        if isinstance(parts[0], mi.Float):
+            return concatenated(parts)
+        return mi.Color3f([concatenated(channel) for channel in zip(*parts, strict=True)])
+
+    def _depths_at(self, p: mi.Point3f) -> mi.Float | mi.Color3f:
+        """Return the optical depths between world positions and the emitter."""
+        ray, near, far = self._line(p)
+        return optical_depth(self._medium, ray, near, far, near < far, dr.inf)
 
     def _extinction(
         self, scene: mi.Scene, depth: mi.Float | mi.Color3f, classes: VoxelClasses | None
@@ -293,18 +322,21 @@ def direct_lights_of(
     voxels: mi.UInt32,
     dense: bool,
     classes: VoxelClasses | None = None,
+    pause: Callable[[], None] = lambda: None,
 ) -> list[DirectLight]:
     """Return the direct light of all spot lights of a scene.
 
     Point lights and suns are included if the voxels are optically ``dense`` and the scene has no
-    surfaces. ``voxels`` are flat indices; ``classes`` is None without surfaces and other media.
+    surfaces. ``voxels`` are flat indices; ``classes`` is None without surfaces and other media;
+    ``pause`` as in `DirectLight`.
     """
     if not dr.width(voxels):
         return []
     emitters = spot_lights(scene)
     if dense and medium.is_isolated:
         emitters = EmittersByKind(scene.emitters()).of(EmitterKind.SUN, *POINT_LIKE)
-    return [DirectLight(scene, emitter, medium, grid, voxels, classes) for emitter in emitters]
+    where = medium, grid, voxels, classes
+    return [DirectLight(scene, emitter, *where, pause) for emitter in emitters]
 
 
 def mean_over(

@@ -98,7 +98,8 @@ class ScatteredIrradiance:
         coarse = coarse_medium(self._medium)
         settings = replace(settings, resolution=max(coarse.sigma_t.grid.shape))
         solver = choose_solver(scene, coarse, "sweep", -1, settings.resolution)
-        part = CachedMedium(scene, description, coarse, settings, solver, "", edited=False)
+        part = CachedMedium(scene, description, coarse, settings, solver, "")
+        part.start(scene)
         part.refine(scene, 0, False, None)
         found = np.array(part.cache.scattered)
         if self._channels == 1 and found.shape[3] > 1:

@@ -64,6 +64,10 @@ class CacheBuilder:
         #: the visible media of the scene, each with its cache
         self.parts: list[CachedMedium] = []
         self._version: SceneVersion | None = None
+        # the media of this version before their caches are created, and whether the version before
+        # it was of the same objects
+        self._described: list[CachedMedium] = []
+        self._edited = False
         self._stages: list[Stage] = []
         self._checkpointed = 0  # number of active `checkpoints` contexts, which save the caches
         #: whether the first two batches may be rendered while incomplete; see `Solver.preview`
@@ -106,31 +110,47 @@ class CacheBuilder:
                 return
             self.settings, self.samples = other.settings, other.samples
             self.parts, self._version = other.parts, other._version
+            self._described = []
             self.revision += 1
 
     def fit(self, scene: mi.Scene) -> None:
         """Update the media to ``scene``; replace caches that are no longer valid by empty ones."""
         with self.lock:
-            self._fit(scene)
+            self._describe(scene)
+            if not self._described:
+                return
+            # An exception may end this half-way.
+            version, self._version = self._version, None
+            parts, self._described = self._described, []
+            for part in parts:
+                part.start(scene, self._edited)
+            self.parts, self._version = parts, version
+            self.revision += 1
 
-    def _fit(self, scene: mi.Scene) -> None:
+    def describe(self, scene: mi.Scene) -> list[CachedMedium]:
+        """Update the media to ``scene`` and return them, without the caches that `fit` creates."""
+        with self.lock:
+            self._describe(scene)
+            return self._described or self.parts
+
+    def _describe(self, scene: mi.Scene) -> None:
         volume = self._emission if isinstance(self._emission, mi.Volume) else None
         version = SceneVersion(scene, volume, self._version)
         changes = version.changes(self._version) if self._version is not None else []
         if self._version is None or changes:
-            edited = bool(changes) and version.shares_objects_with(self._version)
-            if edited:
+            self._edited = bool(changes) and version.shares_objects_with(self._version)
+            if self._edited:
                 names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
             # Keep grids while parameters carry gradients: another grid makes the objective jump.
-            grids = _grids(self.parts) if edited and version.carries_gradients else {}
-            self.parts, self._version = [], None
+            grids = _grids(self.parts) if self._edited and version.carries_gradients else {}
+            self.parts, self._described, self._version = [], [], None
             self.revision += 1
             description = compile_scene(scene, self._baked_emission(), self.settings.max_depth)
             media = description.visible
             wanted = (self.settings.solver, self.settings.max_depth, self.settings.resolution)
             settings = replace(self.settings, samples=self._wanted)
-            self.parts = [
+            self._described = [
                 CachedMedium(
                     scene,
                     description,
@@ -138,7 +158,6 @@ class CacheBuilder:
                     settings,
                     choose_solver(scene, medium, *wanted),
                     medium.name if len(media) > 1 else "",
-                    edited,
                     self.pause,
                     grids.get((medium.name, _data_shape(medium))),
                 )

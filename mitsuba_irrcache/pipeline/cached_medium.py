@@ -67,13 +67,12 @@ class CacheSettings:
 
 
 class CachedMedium:
-    """A medium with its cache, which is None if none is needed (``max_depth`` below 2, or a closed
-    form).
+    """A medium with its cache, which is None before `start`, and if none is needed (``max_depth``
+    below 2, or a closed form).
 
     Args:
         solver: result of `choose_solver`.
         name: distinguishes the medium from other visible ones of the scene; "" without others.
-        edited: whether the scene is an edited version of one that had a cache.
         pause: as in `CacheBuilder`.
         grid: grid of the cache before an edit, which is kept while parameters carry gradients,
             because an objective would jump if it changed. None: choose a grid.
@@ -87,13 +86,13 @@ class CachedMedium:
         settings: CacheSettings,
         solver: tuple[type[Solver], str],
         name: str,
-        edited: bool,
         pause: Callable[[], None] = lambda: None,
         grid: Grid | None = None,
     ) -> None:
-        if grid is not None and grid.shared(Grid(grid.shape, medium.frame)) is grid:
-            grid = None  # the medium has moved
-        self._grid = grid
+        """Choose the grid of the cache.
+
+        Raises IrrcacheError if the cache would exceed the available memory.
+        """
         self.settings, self.medium, self.name = settings, medium, name
         self.description = description
         self._pause = pause
@@ -107,12 +106,18 @@ class CachedMedium:
         self.cache: IrradianceCache | None = None
         #: closed form that replaces the cache; None if there is a cache, or no scattering
         self.half_space: HalfSpace | None = None
+        #: grid of the cache; None if no cache is needed
+        self.grid: Grid | None = None
         if settings.max_depth in (0, 1):
             return
+        if grid is not None and grid.shared(Grid(grid.shape, medium.frame)) is grid:
+            grid = None  # the medium has moved
         resolution = settings.resolution or (max(grid.shape) if grid is not None else 0)
         reason = needs_no_cache(scene, medium, settings.max_depth, resolution)
         if reason is None:
-            self.cache = self._start_cache(scene, edited)
+            self.grid, self._size_reason = self._choose_grid(grid)
+            self._basis = _angular_basis(scene, medium)
+            self._check_memory(self.grid, self._basis.count if self._basis is not None else 0)
             return
         mi.Log(
             mi.LogLevel.Info,
@@ -120,6 +125,14 @@ class CachedMedium:
             "no cache is built. Set resolution for a cache.",
         )
         self.half_space = HalfSpace(scene, medium, settings.max_depth)
+
+    def start(self, scene: mi.Scene, edited: bool = False) -> None:
+        """Create the cache if one is needed: load it from its file, or leave it empty.
+
+        ``edited``: whether the scene is an edited version of one that had a cache.
+        """
+        if self.grid is not None:
+            self.cache = self._start_cache(scene, edited)
 
     @property
     def label(self) -> str:
@@ -193,15 +206,13 @@ class CachedMedium:
     def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
         """Load the cache from its file if it exists; otherwise create an empty one."""
         settings, medium, solver = self.settings, self.medium, self.solver
-        grid, size_reason = self._choose_grid()
-        basis = _angular_basis(scene, medium)
-        self._check_memory(grid, basis.count if basis is not None else 0)
+        grid, basis = self.grid, self._basis
         if settings.warns:
             warn_of_dense_border(medium, grid)
             if not warn_of_opaque_voxels(medium, grid, settings.max_depth):
                 warn_of_unresolved_detail(medium, grid)
         active, classes = self._active_voxels(scene, grid)
-        self._log_choices(grid, size_reason, dr.width(active))
+        self._log_choices(grid, self._size_reason, dr.width(active))
         samples = settings.samples or solver.default_samples(
             medium, settings.max_depth, dr.width(active)
         )
@@ -255,11 +266,11 @@ class CachedMedium:
             return f"there are {lamps} area emitters, and only {MAX_LAMPS} are treated as narrow"
         return None
 
-    def _choose_grid(self) -> tuple[Grid, str]:
-        """Return the grid of the cache, and why it has its size."""
-        if self._grid is None:
+    def _choose_grid(self, known: Grid | None) -> tuple[Grid, str]:
+        """Return the grid of the cache, the ``known`` one if any, and why it has its size."""
+        if known is None:
             return choose_grid(self.medium, self.settings.resolution, self.solver.size_rule)
-        grid = self._grid.shared(self.medium.sigma_t.grid, self.medium.albedo.grid)
+        grid = known.shared(self.medium.sigma_t.grid, self.medium.albedo.grid)
         return grid, "as before, since parameters carry gradients"
 
     def _active_voxels(self, scene: mi.Scene, grid: Grid) -> tuple[mi.UInt32, VoxelClasses | None]:
@@ -298,7 +309,7 @@ class CachedMedium:
         medium, lights = self.medium, []
         if self.solver.knows_direct_lights(scene, medium, grid, active):
             dense = border_error(medium, grid) > SMALL_BORDER_ERROR
-            lights = direct_lights_of(scene, medium, grid, active, dense, classes)
+            lights = direct_lights_of(scene, medium, grid, active, dense, classes, self._pause)
             lights += area_lights_of(scene, medium, grid, active, classes, samples)
         if medium.refracts:  # radiance of emitters outside reaches voxels only by refraction
             lights = [light for light in lights if _is_within(medium, light.emitter)]

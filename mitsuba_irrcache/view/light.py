@@ -86,7 +86,10 @@ class Light:
         self._builder = CacheBuilder(settings, emission, factor)
         self._builder.pause.action = pause
         self._builder.early = True
-        self._coarse: CachedMedium | None = None
+        #: the media of the scene; empty before `prepare`
+        self.parts: list[CachedMedium] = []
+        # the media with coarse caches, until their own have been refined; empty if not needed
+        self._coarse: list[CachedMedium] = []
         #: incremented whenever better caches are available
         self.revision = 0
         #: seconds spent in the solver
@@ -96,18 +99,13 @@ class Light:
         self._snapshots: dict[tuple[bool, bool], tuple[int, CacheSnapshot]] = {}
 
     @property
-    def parts(self) -> list[CachedMedium]:
-        """Return the media with their caches; empty before `prepare`."""
-        return self._builder.parts
-
-    @property
     def samples(self) -> int:
         """Return the samples per voxel."""
         return self._builder.done
 
     @property
     def solver(self) -> str:
-        return self._builder.solver
+        return self.parts[0].solver.name if self.parts else ""
 
     @property
     def error(self) -> float:
@@ -117,7 +115,7 @@ class Light:
     @property
     def is_dark(self) -> bool:
         """Return whether the caches are zero and need no refinement."""
-        return bool(self.parts) and self._builder.is_dark
+        return bool(self._builder.parts) and self._builder.is_dark
 
     @property
     def is_emissive(self) -> bool:
@@ -125,15 +123,20 @@ class Light:
         return any(part.medium.emission is not None for part in self.parts)
 
     def prepare(self) -> None:
-        """Find the media of the scene.
+        """Find the media of the scene, and create empty caches, at first coarse ones if the others
+        would delay the first image.
 
         Raises IrrcacheError for scenes that cannot be rendered and for scenes without a medium.
         """
-        self._builder.fit(self.scene)
+        self.parts = self._builder.describe(self.scene)
         if not self.parts:
             raise IrrcacheError(
                 "view: the scene has no medium that a camera could see; irrcache render shows it."
             )
+        if self._is_slow:
+            self._coarse = [self._started_coarse(part) for part in self.parts]
+        else:
+            self._builder.fit(self.scene)
 
     def refine(self) -> None:
         """Refine the caches once; the first refinement may use a coarse grid."""
@@ -146,42 +149,43 @@ class Light:
         self.failed = False
 
     def _refine(self) -> None:
-        builder, first = self._builder, not self.revision
-        done, batch = builder.done, self.parts[0].cache.batch if self.parts[0].cache else 0
-        if builder.is_dark:
-            pass  # an image without emitters still shows emission and transmittance
-        elif first and self._is_slow:
-            self._coarse = self._at_once()
+        builder = self._builder
+        if self._coarse and not self.revision:
+            for part in self._coarse:
+                if not part.is_dark:
+                    part.refine(self.scene, part.cache.batch, False, None)
         else:
-            if builder.has_preview and done < OPENING:
-                builder.samples = max(2 * done, FIRST)
-            else:
-                builder.samples = done + batch
-            builder.update(self.scene, lambda *_: builder.pause())
-            self._coarse = None
+            builder.fit(self.scene)
+            self.parts = builder.parts
+            if not builder.is_dark:  # an image without emitters shows emission and transmittance
+                self._refine_fully()
+            self._coarse = []
         self.revision += 1
+
+    def _refine_fully(self) -> None:
+        """Refine the caches of the whole resolution."""
+        builder = self._builder
+        done, batch = builder.done, self.parts[0].cache.batch if self.parts[0].cache else 0
+        if builder.has_preview and done < OPENING:
+            builder.samples = max(2 * done, FIRST)
+        else:
+            builder.samples = done + batch
+        builder.update(self.scene, lambda *_: builder.pause())
 
     @property
     def _is_slow(self) -> bool:
-        """Return whether a coarse grid would be much faster."""
-        voxels = self.parts[0].cache.grid.voxel_count
-        return not self._builder.has_preview and voxels > MANY_VOXELS
+        """Return whether coarse grids would be much faster."""
+        grids = [p.grid for p in self.parts if not p.solver.has_preview and p.grid is not None]
+        return any(grid.voxel_count > MANY_VOXELS for grid in grids)
 
-    def _at_once(self) -> CachedMedium:
-        """Return the medium with a first estimate on a coarse grid."""
-        builder, first = self._builder, self.parts[0]
-        settings = replace(builder.settings, resolution=COARSE)
+    def _started_coarse(self, part: CachedMedium) -> CachedMedium:
+        """Return a medium with an empty cache on a coarse grid."""
+        settings = replace(part.settings, resolution=COARSE)
+        solver = part.solver, "a first look"
         coarse = CachedMedium(
-            self.scene,
-            first.description,
-            first.medium,
-            settings,
-            (first.solver, "a first look"),
-            "",
-            False,
-            builder.pause,
+            self.scene, part.description, part.medium, settings, solver, "", self._builder.pause
         )
-        coarse.refine(self.scene, coarse.cache.batch, False, None)
+        coarse.start(self.scene)
         return coarse
 
     def snapshot(self, layered: bool, with_error: bool) -> CacheSnapshot:
@@ -189,7 +193,7 @@ class Light:
         key = layered, with_error
         known = self._snapshots.get(key)
         if known is None or known[0] != self.revision:
-            parts = self.parts if self._coarse is None else [self._coarse]
+            parts = self._coarse or self.parts
             s = self.march
             camera_rays = camera_rays_of(
                 parts, self.settings, s.hide_emitters, s.quadrature, s.step, layered, with_error

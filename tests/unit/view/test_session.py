@@ -17,12 +17,15 @@ import pytest
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.images import read_image
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
+from mitsuba_irrcache.view import light as lights
 from mitsuba_irrcache.view import picture, saving
 from mitsuba_irrcache.view import session as sessions
 from mitsuba_irrcache.view import window as windows
 from mitsuba_irrcache.view.appearance import Appearance
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document
+from mitsuba_irrcache.view.light import Light
 from mitsuba_irrcache.view.picture import KINDS, Look, Samples
 from mitsuba_irrcache.view.saving import render_command, save_view
 from mitsuba_irrcache.view.session import Session
@@ -210,7 +213,7 @@ def test_no_kernel_is_compiled_for_another_edit(session, kernels):
         values = np.random.default_rng(1).random((5, 6, 7), np.float32) * np.float32(top)
         session._edit(lambda document: document.set_volumes({"density.vol": values}))
         session._light.refine()
-        shapes.add(session._light.parts[0].cache.grid.shape)
+        shapes.add(session._light.parts[0].grid.shape)
         dr.sync_thread()
 
     # Kernels contain the number of an emitter among all of Mitsuba's objects, which alternates as
@@ -234,6 +237,35 @@ def test_an_edit_is_displayed_coarsely_first(session):
     first, *others = screen.pictures[count:]
     assert first.moving and first.pixels.size < others[-1].pixels.size
     assert not any(p.moving for p in others)
+
+
+def test_an_edit_of_many_voxels_computes_only_a_coarse_cache_at_first(session, monkeypatch):
+    """Nothing is computed for the voxels of the whole resolution before the first image.
+
+    Optical depths from all voxels to a sun delayed it by seconds.
+    """
+    monkeypatch.setattr(lights, "MANY_VOXELS", 1000)
+    monkeypatch.setattr(lights, "COARSE", 8)
+    created, create = [], CachedMedium.start
+
+    def start(part: CachedMedium, *args: object) -> None:
+        create(part, *args)
+        created.append(part.cache.grid.shape)
+
+    monkeypatch.setattr(CachedMedium, "start", start)
+
+    def edit_and_refine() -> Light:
+        session._edit(lambda document: document.set_density(3.0))
+        light = session._light
+        light.refine()
+        assert created == [(8, 8, 8)]
+        assert light.parts[0].grid.voxel_count > 1000
+        light.refine()
+        return light
+
+    light = session.call(edit_and_refine)
+    assert created[1:] == [light.parts[0].cache.grid.shape]
+    assert light.samples > 0
 
 
 def test_each_edit_is_displayed_while_others_wait(session, monkeypatch):
