@@ -15,7 +15,7 @@ They are also defined behind a flat emitter, and continuous across its plane.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -130,7 +130,16 @@ class AreaLight(DirectLight):
             return dr.full(mi.Float, 1, dr.width(p))
         if self._lines == CLOSEST:
             return self._length_to(p, self._solid_angle.closest(p))
-        return sum(self._length_to(p, place) for place in self._places) * (1 / len(self._places))
+        return self._mean_length(p)
+
+    @symbolic
+    def _mean_length(self, p: mi.Point3f):
+        """Return the mean length in the medium of the lines from ``p`` to several points."""
+        total, i, count = mi.Float(0), mi.UInt32(0), dr.opaque(mi.UInt32, dr.width(self._places))
+        while dr.hint(i < count, label="points on an emitter"):
+            total += self._length_to(p, dr.gather(mi.Point3f, self._places, i))
+            i += 1
+        return total / mi.Float(count)
 
     def _length_to(self, p: mi.Point3f, place: mi.Point3f) -> mi.Float:
         """Return the length in the medium of the line to a ``place`` on the emitter."""
@@ -234,19 +243,16 @@ class AreaLight(DirectLight):
         shift = shift_at(p) if shift is None else shift
         return self._depth_to_points(mean, p, self._lookup_points, shift)
 
-    def depths_along(
-        self,
-        ray: mi.Ray3f,
-        ends: tuple[mi.Float, mi.Float],
-        means: tuple,
-        places: Sequence[mi.Float | float],
-    ) -> list[mi.Float | mi.Color3f]:
+    def depth_along(
+        self, ray: mi.Ray3f, ends: tuple[mi.Float, mi.Float], means: tuple
+    ) -> Callable[[mi.Float], mi.Float | mi.Color3f]:
         """See the base class; a parabola, if depths are averages over points."""
+        depth_at = super().depth_along(ray, ends, means)
         if self._lines != EACH:
-            return super().depths_along(ray, ends, means, places)
-        first, middle, last = super().depths_along(ray, ends, means, (0.0, 0.5, 1.0))
+            return depth_at
+        first, middle, last = _at_three_places(depth_at, 0 * means[0])
         slope, curvature = 4 * middle - 3 * first - last, 2 * (first + last) - 4 * middle
-        return [dr.maximum(first + u * (slope + u * curvature), 0) for u in places]
+        return lambda u: dr.maximum(first + u * (slope + u * curvature), 0)
 
     def _depth_to_points(
         self, mean: mi.Float | mi.Color3f, p: mi.Point3f, count: mi.UInt32, shift: mi.Vector2f
@@ -555,12 +561,27 @@ def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:
     return bool(dr.any(medium.contains(shape.sample_position(0.0, sample).p)))
 
 
-def _places_on(shape: mi.Shape) -> list[mi.Point3f]:
+def _places_on(shape: mi.Shape) -> mi.Point3f:
     """Return four points of a shape, those of a product rule for a rectangle."""
-    samples = [mi.Point2f(u, v) for u in GAUSS_POINTS for v in GAUSS_POINTS]
-    places = [shape.sample_position(0.0, sample).p for sample in samples]
-    dr.make_opaque(places)
+    places = shape.sample_position(0.0, mi.Point2f(*dr.meshgrid(*2 * [mi.Float(GAUSS_POINTS)]))).p
+    dr.eval(places)
     return places
+
+
+@symbolic
+def _at_three_places(
+    function: Callable[[mi.Float], mi.Float | mi.Color3f], zero: mi.Float | mi.Color3f
+):
+    """Evaluate a function that returns values of the type of ``zero`` at 0, 0.5 and 1."""
+    first, middle, last = zero, zero, zero
+    i, count = mi.UInt32(0), dr.opaque(mi.UInt32, 3)
+    while dr.hint(i < count, label="three places"):
+        value = function(0.5 * mi.Float(i))
+        first = dr.select(i == 0, value, first)
+        middle = dr.select(i == 1, value, middle)
+        last = dr.select(i == 2, value, last)
+        i += 1
+    return first, middle, last
 
 
 def _radiance(emitter: mi.Emitter) -> mi.Spectrum:

@@ -14,8 +14,7 @@ Camera rays exclude these values and evaluate E(p) exp(-tau(p)) instead.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Callable
 from typing import NamedTuple
 
 import drjit as dr
@@ -144,20 +143,16 @@ class DirectLight:
         # docs/primer, eq. (2.5)
         return mean * self.length(p)
 
-    def depths_along(
-        self,
-        ray: mi.Ray3f,
-        ends: tuple[mi.Float, mi.Float],
-        means: tuple,
-        places: Sequence[mi.Float | float],
-    ) -> list[mi.Float | mi.Color3f]:
-        """Return optical depths between places on segments of rays and the emitter.
+    def depth_along(
+        self, ray: mi.Ray3f, ends: tuple[mi.Float, mi.Float], means: tuple
+    ) -> Callable[[mi.Float], mi.Float | mi.Color3f]:
+        """Return the optical depth between places on segments of rays and the emitter, as a
+        function of the place, a fraction of the segment.
 
-        ``ends`` are distances along the rays, ``means`` the mean extinctions there, ``places`` are
-        fractions of the segments.
+        ``ends`` are distances along the rays, ``means`` the mean extinctions there.
         """
         shift = shift_at(ray(ends[0]))
-        return [self.depth_of(dr.lerp(*means, u), ray(dr.lerp(*ends, u)), shift) for u in places]
+        return lambda u: self.depth_of(dr.lerp(*means, u), ray(dr.lerp(*ends, u)), shift)
 
     def peak_depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """Return the optical depth of scattering into the truncated forward peak between world
@@ -494,32 +489,10 @@ class DirectLightAlongRays:
         """Integrate the radiance scattered towards the camera along a segment.
 
         ``scattering`` selects the part of it, ``peak_depth`` is as in `AngularField.factor`.
-
-        The segment is divided into parts. In a part with constant extinction c and optical depth C,
-        along which the optical depth to the emitter changes linearly from s0 to s0 + S,
-        int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), for any optical depth.
         """
-        # docs/primer, eq. (2.6)
-        ray, (a, b), extinctions, means, weights, albedo = segment
-        light = self._light
+        ray, (a, b), extinctions, _, weights, _ = segment
         near, far = (extinction * (b - a) for extinction in extinctions)
-        at = self._parts(ray, a, b, 0.5 * (near + far))
-        middles = [0.5 * (u + v) for u, v in pairwise(at)]
-        depths = light.depths_along(ray, (a, b), means, [*at, *middles])
-        depths, inner = depths[: len(at)], depths[len(at) :]
-        passed = [dr.fma(near, u * (1 - 0.5 * u), far * (0.5 * u * u)) for u in at]
-        total = mi.Spectrum(0)
-        for i, u in enumerate(middles):
-            within = passed[i + 1] - passed[i]
-            both = within + depths[i + 1] - depths[i]
-            # A parabola exceeds its chord by 4 u (1 - u) sag; weight this with e^-x u.
-            sag = inner[i] - 0.5 * (depths[i] + depths[i + 1])
-            sag = sag * 4 / (6 + dr.abs(both))
-            exponent = maximum(-both, 0.0) - passed[i] - depths[i] - sag
-            part = within * dr.exp(exponent) * _mean_decay(dr.abs(both))
-            p = ray(dr.lerp(a, b, u))
-            part = mi.Spectrum(part * light.past_others(p) * dr.lerp(*albedo, u))
-            total += part * light.unobstructed(p)
+        total = self._integral(segment, self._parts(ray, a, b, 0.5 * (near + far)))
         # Scale to the absorptance that the quadrature rule computes.
         absorbed = absorptance(0.5 * (near + far))
         rule = dr.select(absorbed > 0, (weights[0] + weights[1]) / absorbed, 1)
@@ -532,13 +505,51 @@ class DirectLightAlongRays:
             total *= gain
         return total * mi.Spectrum(rule) * dr.inv_four_pi
 
+    @symbolic
+    def _integral(self, segment: RaySegment, inner: list[mi.Float]):
+        """Integrate the radiance that isotropic scattering would add, without quadrature weights.
+
+        The segment is divided into parts at the ``inner`` places. In a part with constant
+        extinction c and optical depth C, along which the optical depth to the emitter changes
+        linearly from s0 to s0 + S,
+        int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), for any optical depth.
+        """
+        # docs/primer, eq. (2.6)
+        ray, (a, b), extinctions, means, _, albedo = segment
+        light = self._light
+        near, far = (extinction * (b - a) for extinction in extinctions)
+        depth_at = light.depth_along(ray, (a, b), means)
+        total, u, passed = mi.Spectrum(0), mi.Float(0), 0 * near
+        depth, i, count = depth_at(u), mi.UInt32(0), dr.opaque(mi.UInt32, len(inner) + 1)
+        # One copy of the code: it is most of the code of the ray march.
+        while dr.hint(i < count, label="parts of a segment"):
+            end = mi.Float(1)
+            for number, place in enumerate(inner):
+                end = dr.select(i == number, place, end)
+            middle = 0.5 * (u + end)
+            depth_end, depth_middle = depth_at(end), depth_at(middle)
+            passed_end = dr.fma(near, end * (1 - 0.5 * end), far * (0.5 * end * end))
+            within = passed_end - passed
+            both = within + depth_end - depth
+            # A parabola exceeds its chord by 4 u (1 - u) sag; weight this with e^-x u.
+            sag = depth_middle - 0.5 * (depth + depth_end)
+            sag = sag * 4 / (6 + dr.abs(both))
+            exponent = maximum(-both, 0.0) - passed - depth - sag
+            part = within * dr.exp(exponent) * _mean_decay(dr.abs(both))
+            p = ray(dr.lerp(a, b, middle))
+            part = mi.Spectrum(part * light.past_others(p) * dr.lerp(*albedo, middle))
+            total += part * light.unobstructed(p)
+            u, depth, passed = end, depth_end, passed_end
+            i += 1
+        return total
+
     def _parts(
         self, ray: mi.Ray3f, a: mi.Float, b: mi.Float, depth: mi.Float | mi.Color3f
     ) -> list[mi.Float]:
         """Divide a segment of optical ``depth`` into four parts.
 
         Three parts of equal absorptance, one of which is divided at the kink (see `_kink`). Returns
-        the five ends of the parts as fractions of the segment.
+        the inner ends of the parts as fractions of the segment.
         """
         depth = channel_mean(depth)
         absorbed, thin = absorptance(depth), depth < 1e-3
@@ -548,8 +559,7 @@ class DirectLightAlongRays:
         ]
         first, second = thirds
         kink = self._kink(ray, a, b)
-        inner = [minimum(kink, first), clipped(kink, first, second), maximum(kink, second)]
-        return [mi.Float(0), *inner, mi.Float(1)]
+        return [minimum(kink, first), clipped(kink, first, second), maximum(kink, second)]
 
     def _kink(self, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> mi.Float:
         """Locate the kink of `DirectLight.length` between the distances ``a`` and ``b``.

@@ -403,7 +403,9 @@ class TracedCameraRays:
             hit, entry, leave = projection.medium.intersect(ray)
             entry, leave = dr.maximum(entry, state.near), dr.minimum(leave, far)
             hit &= state.active & (state.pointer == projection.medium.pointer)
-            scattered, transmittance, sums, emitted = projection.march(
+            # The paths behind surfaces march by the same code.
+            march = projection.called_march if self.caches_surfaces else projection.march
+            scattered, transmittance, sums, emitted = march(
                 ray, entry, leave, max_background, offset, hit
             )
             scale = luminance(state.transmittance)

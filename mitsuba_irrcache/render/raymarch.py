@@ -281,6 +281,31 @@ class Projection:
             part.state = state
         return state.radiance, mi.Spectrum(state.transmittance), state.gathered, state.emitted
 
+    def called_march(
+        self,
+        ray: mi.Ray3f,
+        near: mi.Float,
+        far: mi.Float,
+        background: mi.Spectrum,
+        offset: mi.Float,
+        active: mi.Bool,
+        scattering: Scattering = Scattering.ALL,
+    ) -> tuple:
+        """Compute `march` by a function call in the kernel, for kernels that march at several
+        places.
+
+        They contain the code once, if it is the same: neither arguments nor results that only some
+        places use are optimised away. Most of the time to the first image is that of compilation.
+        """
+
+        def through(*arguments: dr.ArrayBase) -> tuple:
+            return self.march(*arguments, scattering=scattering)
+
+        arguments = ray, near, far, background, offset, active
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeCalls, False):
+            radiance, passed, *rest = dr.switch(mi.UInt32(0), [through], *arguments)
+        return radiance, dr.select(active, passed, 1), *rest
+
     def zero_sample(self) -> tuple:
         """Return zeros of the same types as `fetch`."""
 

@@ -424,7 +424,9 @@ class _PathFollower:
             hit, entry, leave = projection.medium.intersect(path.ray)
             entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
             hit &= path.active & ~path.clear & (path.pointer == projection.medium.pointer)
-            scattered, transmittance, _, emitted = projection.march(
+            # Camera rays are marched before this, too, by the same code.
+            march = projection.march if self._from_node else projection.called_march
+            scattered, transmittance, _, emitted = march(
                 path.ray,
                 entry,
                 leave,
