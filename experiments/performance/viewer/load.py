@@ -35,9 +35,14 @@ def viewer_memory() -> float:
     for pid in _descendants():
         with suppress(FileNotFoundError, ProcessLookupError, AttributeError):
             if _name(_words(pid)) == "viewer":
-                text = (Path("/proc") / str(pid) / "status").read_text()
-                total += int(re.search(r"VmRSS:\s+(\d+)", text).group(1)) / 1024
+                total += resident_memory(pid)
     return total
+
+
+def resident_memory(pid: int) -> float:
+    """Return the resident memory of a process, MB."""
+    text = (Path("/proc") / str(pid) / "status").read_text()
+    return int(re.search(r"VmRSS:\s+(\d+)", text).group(1)) / 1024
 
 
 def _descendants() -> list[int]:
