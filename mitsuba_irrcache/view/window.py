@@ -48,6 +48,11 @@ class View:
         """Return whether ``other`` has the same camera and the same size."""
         return other is not None and (self.camera, self.size) == (other.camera, other.size)
 
+    def shows_quantities_of(self, other: View) -> bool:
+        """Return whether samples of ``other`` have the layers that this view displays."""
+        mine, its = self.look, other.look
+        return (mine.layered, mine.with_error) == (its.layered, its.with_error)
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:
@@ -78,7 +83,8 @@ class Window:
         self.view: View | None = None
         self.moved = -np.inf  # time of the camera's last movement
         self.fresh = False  # whether the view has not been rendered yet
-        self.outdated = False  # whether the displayed image is older than the last edit
+        # whether the displayed image is older than the last edit, or shows other quantities
+        self.outdated = False
         self.level = len(LEVELS) // 2
         self.samples: Samples | None = None
         self._resting: View | None = None  # the view of `samples`
@@ -105,6 +111,8 @@ class Window:
             return False
         if not view.shows_place_of(old):  # the first image of a window is a coarse one, too
             self.moved = monotonic()
+        elif not view.shows_quantities_of(old):
+            self.outdated = True
         self.view, self.fresh = view, True
         return True
 
@@ -137,7 +145,7 @@ class Window:
     @property
     def needs_coarse(self) -> bool:
         """Return whether a coarse image has to come first: the camera moves, or the displayed image
-        is older than the last edit.
+        is older than the last edit or shows other quantities.
         """
         return self.outdated or (self.fresh and self.is_moving)
 
@@ -166,6 +174,8 @@ class Window:
             seen.stride(1.0)
         self.level = _adapted(self.level, perf_counter() - started)
         self.outdated = False
+        if self._resting is not None and not view.shows_quantities_of(self._resting):
+            self._resting = None  # an image at rest has to follow
         return Picture(pixels, view, 1, True, False)
 
     def refined(

@@ -52,6 +52,8 @@ PATH_CELLS, EMITTER_CELLS = 1 << 11, 1 << 16
 INSET = 1e-3
 #: Offset of the random streams of paths from surfaces among the voxels.
 CROSSING_STREAM = 0x5F00
+#: Smallest number of rows of the table of ordinates, a power of two.
+FEWEST_ROWS = 1024
 #: Parameters of an ordinate that the kernel reads, see `IncomingRadiance._parameters`.
 _INTEGERS = ("first", "width", "axis", "axis_b")
 _REALS = (
@@ -286,7 +288,9 @@ class IncomingRadiance:
         reals = np.column_stack([*columns, geometry.sizes, self._edge, weights])
         forward = geometry.forward[:, None, None]
         ways = [np.where(forward, part, part[:, ::-1]).ravel().tolist() for part in parts]
-        as_list = mi.UInt32([*integers.ravel().tolist(), 0xFFFFFFFF])  # the end, to be searched for
+        # Rows that `_read` never finds.
+        rest = (_searched_rows(len(integers)) - len(integers)) * len(_INTEGERS)
+        as_list = mi.UInt32([*integers.ravel().tolist(), *[0xFFFFFFFF] * rest])
         return (as_list, mi.Float(reals.ravel().tolist())), [mi.Float(way) for way in ways]
 
     def _read(
@@ -296,7 +300,7 @@ class IncomingRadiance:
         integers, reals = parameters
         ordinate = dr.binary_search(
             0,
-            len(self._first) - 1,
+            _searched_rows(len(self._first)) - 1,
             lambda i: dr.gather(mi.UInt32, integers, (i + 1) * len(_INTEGERS)) <= lanes,
         )
         first, begin = ordinate * len(_INTEGERS), ordinate * len(_REALS)
@@ -391,6 +395,15 @@ def _coarse_voxels(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
     result = coarse.index(*(ratio.split(place)[0] for place in fine.voxel_indices(voxel)))
     dr.eval(result)
     return result
+
+
+def _searched_rows(ordinates: int) -> int:
+    """Return the number of rows of the table of ordinates that a binary search covers, more than
+    there are ordinates.
+
+    Kernels contain one step for each factor of two: most numbers of ordinates share a kernel.
+    """
+    return max(FEWEST_ROWS, 1 << ordinates.bit_length())
 
 
 def _any_positive(spectra: list[list]) -> bool:

@@ -239,6 +239,24 @@ def test_an_edit_is_displayed_coarsely_first(session):
     assert not any(p.moving for p in others)
 
 
+@pytest.mark.parametrize("compared", ["off", "error"])
+def test_other_layers_are_displayed_coarsely_first(session, compared):
+    """A view of other layers gets a coarse image at once, and then one at rest.
+
+    The image before, such as an error in false colours, would be mistaken for it.
+    """
+    screen = Screen()
+    window = session.open(screen.show)
+    view = View(front(session), SIZE, compared=compared)
+    session.look(window, view)
+    screen.wait(lambda p: p.final if compared == "off" else p.compared is not None)
+    session.look(window, replace(view, look=replace(view.look, kind="depth"), compared="off"))
+    screen.wait(lambda p: p.view == window.view and p.final)
+    first, *others = [p for p in screen.pictures if p.view == window.view]
+    assert first.moving
+    assert others and not any(p.moving for p in others)
+
+
 def test_an_edit_of_many_voxels_computes_only_a_coarse_cache_at_first(session, monkeypatch):
     """Nothing is computed for the voxels of the whole resolution before the first image.
 
