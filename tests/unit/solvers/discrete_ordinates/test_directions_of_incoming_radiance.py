@@ -133,3 +133,28 @@ def test_paths_continue_their_tracks(scenes, monkeypatch):
             first = own[:, k] + slope * (lower[axis] + 0.5 - own[:, axis])
             away = (first - offset + 0.5) % 1 - 0.5
             assert np.quantile(np.abs(away), 0.95) < 5e-3
+
+
+def test_any_number_of_ordinates_is_sampled_by_one_kernel(monkeypatch, kernels):
+    """Each ordinate is found among 3 and among 15, without compiling the search anew.
+
+    The kernel that traces radiance from surfaces, one of the largest, is compiled once per scene.
+    """
+    without_paths(monkeypatch)
+    tracks, found = lines(0.0), []
+
+    def sample(count: int) -> None:
+        offsets = np.full((count, 2), 0.5)
+        number, _, hit, ray, _ = sampled_rays(tracks, WAYS[:count], offsets)[1]
+        dr.eval(number, hit, ray.d)
+        found.append((np.array(number), np.array(hit), np.array(ray.d)))
+
+    sample(3)
+    used = kernels(lambda: sample(len(WAYS)))
+    sampling = [k for k in used if k["operation_count"] > 100]  # without conversions to NumPy
+    assert sampling and all(k["cache_hit"] for k in sampling)
+    for count, (number, hit, direction) in zip((3, len(WAYS)), found, strict=True):
+        assert set(number[hit]) == set(range(2 * count))
+        sign = 1 - 2.0 * (number % 2)
+        towards = np.abs((sign * direction * WAYS[number // 2].T).sum(axis=0))
+        np.testing.assert_allclose(towards[hit], 1, rtol=1e-5)
