@@ -155,8 +155,9 @@ class Light:
                 if not part.is_dark:
                     part.refine(self.scene, part.cache.batch, False, None)
         else:
-            builder.fit(self.scene)
-            self.parts = builder.parts
+            if self._coarse:
+                builder.fit(self.scene)
+                self.parts = builder.parts
             if not builder.is_dark:  # an image without emitters shows emission and transmittance
                 self._refine_fully()
             self._coarse = []

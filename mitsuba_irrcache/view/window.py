@@ -140,6 +140,8 @@ class Window:
             return False
         if self.fresh or not self.view.shows_place_of(self._resting) or self._light is not light:
             return True
+        if not self.view.shows_quantities_of(self._resting):
+            return True
         return not first and (self._revision != revision or self.samples.count < SAMPLES)
 
     @property
@@ -174,8 +176,6 @@ class Window:
             seen.stride(1.0)
         self.level = _adapted(self.level, perf_counter() - started)
         self.outdated = False
-        if self._resting is not None and not view.shows_quantities_of(self._resting):
-            self._resting = None  # an image at rest has to follow
         return Picture(pixels, view, 1, True, False)
 
     def refined(
