@@ -113,6 +113,11 @@ class Light:
         return self._builder.relative_error
 
     @property
+    def is_preliminary(self) -> bool:
+        """Return whether coarse caches are displayed, or none yet."""
+        return bool(self._coarse)
+
+    @property
     def is_dark(self) -> bool:
         """Return whether the caches are zero and need no refinement."""
         return bool(self._builder.parts) and self._builder.is_dark

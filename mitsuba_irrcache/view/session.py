@@ -300,6 +300,9 @@ class Session:
             return True
         if self._reserved:
             return False
+        # Further samples of an image of coarse caches would be discarded.
+        if self._light is not None and self._light.is_preliminary and self._improve():
+            return True
         for _ in range(len(self._chores)):
             self._chores.rotate()
             if self._chores[0]():

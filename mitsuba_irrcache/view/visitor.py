@@ -228,8 +228,17 @@ class Visitor:
         view = View(seen, size, look, compared)
         if self._view is not None and view != self._view and view.shows_place_of(self._view):
             self._channel.send("note", "rendering ...", self._key)  # may take seconds
+        if self._view is not None and compared != self._view.compared:
+            self._announce_comparison(compared)
         self._view = view
         self.session.look(self.window, self._view)
+
+    def _announce_comparison(self, compared: str) -> None:
+        """Replace the captions of the comparison before, until the first image of the new one."""
+        found = {"mode": "off"}
+        if compared != "off":
+            found = described(Compared(compared, "volpath: waiting for its first sample"))
+        self._channel.send("comparison", found, self._key)
 
     def _show(self, picture: Picture) -> None:
         """Queue an image for sending; called in the session's thread, which must not block."""

@@ -3,7 +3,9 @@
 
 A browser drags, zooms, edits, saves, reloads, compares, and opens and closes further windows, at
 random from a seed. Records the memory of the viewer, second by second, the actions, and the errors:
-tracebacks in its log, errors in the browsers' consoles.
+tracebacks in its log, errors in the browsers' consoles. Memory depends on the number of windows and
+on what they do; hence it is also measured after each quarter of the time with a single window that
+shows a final image without a comparison.
 """
 
 from __future__ import annotations
@@ -26,28 +28,28 @@ from mitsuba_irrcache.view.slice_panel import ALL, AXES, NONE, THIS
 #: Maximum number of windows.
 MOST_WINDOWS = 3
 SIZE = (800, 400)
+#: Seconds until the memory of an image that is final has been released.
+REST = 3.0
 
 
 @dataclass
 class Usage:
-    """The results: ``memory`` as (seconds, MB), and ``done`` with counts by name."""
+    """The results: ``memory`` as (seconds, MB), ``at_rest`` likewise, with a single window at rest,
+    and ``done`` with counts by name.
+    """
 
     memory: list[tuple[float, float]] = field(default_factory=list)
+    at_rest: list[tuple[float, float]] = field(default_factory=list)
     done: dict[str, int] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
     pictures: int = 0
 
     @property
     def growth(self) -> float:
-        """Return the growth in MB from the second quarter of the time to the last.
-
-        The first quarter includes initialisations. The tenth percentile of each excludes temporary
-        memory of caches and windows.
+        """Return the growth in MB of ``at_rest`` after the first quarter, which includes
+        initialisations.
         """
-        seconds, sizes = np.array(self.memory).T
-        part = seconds / seconds[-1]
-        early = np.percentile(sizes[(part > 0.25) & (part <= 0.5)], 10)
-        return float(np.percentile(sizes[part > 0.75], 10) - early)
+        return self.at_rest[-1][1] - self.at_rest[0][1]
 
 
 class User:
@@ -159,6 +161,16 @@ class User:
             self.leave(window)
             self.windows.remove(window)
 
+    def rest(self) -> None:
+        """Close all windows but one, and wait for its final image."""
+        while len(self.windows) > 1:
+            self.close(self.windows[-1])
+        (window,) = self.windows
+        window.choose("compare", COMPARISONS[0])
+        window.choose("show", KINDS[0])
+        window.wait_for("final")
+        time.sleep(REST)
+
     def leave(self, window: Window) -> None:
         """Record the errors of a window, and close it."""
         self.usage.errors += window.errors
@@ -179,10 +191,12 @@ def use(browser: Browser, view: list[str], seconds: float, seed: int, log: Path)
     with viewer(view, log) as address:
         user = User(browser, address, rng)
         usage, began = user.usage, time.monotonic()
-        while (passed := time.monotonic() - began) < seconds:
-            usage.memory.append((passed, viewer_memory()))
-            user.act()
-        usage.memory.append((time.monotonic() - began, viewer_memory()))
+        for quarter in range(1, 5):
+            while (passed := time.monotonic() - began) < seconds * quarter / 4:
+                usage.memory.append((passed, viewer_memory()))
+                user.act()
+            user.rest()
+            usage.at_rest.append((time.monotonic() - began, viewer_memory()))
         for window in user.windows:
             user.leave(window)
     said = log.read_text()
@@ -204,11 +218,12 @@ def main() -> None:
         usage = use(browser, view, args.seconds, args.seed, log)
     sizes = [size for _, size in usage.memory]
     print(", ".join(f"{count} x {name}" for name, count in sorted(usage.done.items())))
-    print(f"{usage.pictures} pictures were shown in {usage.memory[-1][0]:.0f} s")
+    print(f"{usage.pictures} pictures were shown in {usage.at_rest[-1][0]:.0f} s")
     print(
         f"memory {sizes[0]:.0f} MB at first, {max(sizes):.0f} MB at most, {sizes[-1]:.0f} MB last"
     )
-    print(f"from the second quarter to the last it grew by {usage.growth:.0f} MB")
+    sizes = ", ".join(f"{size:.0f}" for _, size in usage.at_rest)
+    print(f"with one window at rest, after each quarter of the time: {sizes} MB")
     print("errors:", "\n".join(usage.errors) or "none")
     found = vars(usage) | {"growth": usage.growth}
     (args.output / f"usage{args.seed}.json").write_text(json.dumps(found, indent=1))

@@ -7,8 +7,7 @@
   class Light extends HTMLElement {
     connectedCallback() {
       this.innerHTML = `<canvas role="img" aria-label="direction to the sun, drag to change it"></canvas>
-        <span><span class="irrcache-quiet" title="a new direction switches the sun on">drag;
-        Shift: behind (dashed)</span>
+        <span><span class="irrcache-quiet" data-id="usage"></span>
         <span class="irrcache-row"><label title="azimuth, about the upward axis">azim. °<input
           type="number" step="1" min="-360" max="360" data-id="azimuth"></label><label
           title="elevation above the horizon">elev. °<input type="number" step="1" min="-90"
@@ -35,8 +34,10 @@
 
     disconnectedCallback() { this.stops.forEach((stop) => stop()); }
 
-    /** Show the angles in their fields, unless the user is typing into them. */
+    /** Show how the sun is moved, and the angles in their fields, unless the user is typing into them. */
     fill() {
+      this.querySelector("[data-id=usage]").textContent = this.lighting.sun > 0
+        ? "drag; Shift: behind (dashed)" : "no sun: drag to add one";
       for (const field of this.fields) {
         if (field !== document.activeElement) field.value = Math.round(this.lighting[field.dataset.id]);
       }

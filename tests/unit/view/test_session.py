@@ -6,6 +6,7 @@ import shlex
 import threading
 import time
 import weakref
+from collections import deque
 from dataclasses import replace
 
 import drjit as dr
@@ -284,6 +285,32 @@ def test_an_edit_of_many_voxels_computes_only_a_coarse_cache_at_first(session, m
     light = session.call(edit_and_refine)
     assert created[1:] == [light.parts[0].cache.grid.shape]
     assert light.samples > 0
+
+
+def test_fine_voxels_precede_further_samples_and_volpath(session, monkeypatch):
+    """An image of coarse caches, displayed once, gets neither samples nor a reference: they took
+    turns with the solver, which delayed the final voxels by seconds in large windows.
+    """
+    monkeypatch.setattr(lights, "MANY_VOXELS", 1000)
+    monkeypatch.setattr(lights, "COARSE", 8)
+    during: list[bool] = []
+
+    def recorded(chore):
+        def run() -> bool:
+            during.append(session._light.is_preliminary)
+            return chore()
+
+        return run
+
+    screen = Screen()
+    window = session.open(screen.show)
+    session.look(window, View(front(session), SIZE, compared="swipe"))
+    screen.wait(lambda picture: picture.samples > 1)
+    session._chores = deque(recorded(chore) for chore in session._chores)
+    session.edit(lambda document: document.set_density(3.0))
+    light = session._light
+    screen.wait(lambda picture: picture.samples > 1 and session.light is light)
+    assert during and not any(during)
 
 
 def test_each_edit_is_displayed_while_others_wait(session, monkeypatch):
