@@ -39,6 +39,8 @@ CHECK_SECONDS = 0.02
 #: Seconds for which another edit waits for the first image of an edit. Otherwise no image would
 #: appear while a slider or the sun is dragged, which makes an edit before the last one is shown.
 EDIT_SECONDS = 0.5
+#: Seconds of an image at rest that follow a pass of the solver, in units of that pass.
+PICTURE_SHARE = 0.5
 #: (width, height) of an image that is displayed until windows have cameras of their own. It is
 #: wider than most windows; they crop it.
 FIRST_LOOK = (480, 240)
@@ -427,7 +429,13 @@ class Session:
             raise Superseded
 
     def _refine_picture(self) -> bool:
-        return self._show_resting(first=False)
+        """Add samples to images at rest for as long as a part of a solver pass."""
+        until, done = monotonic() + PICTURE_SHARE * self._pass_seconds, False
+        while self._show_resting(first=False):
+            done = True
+            if monotonic() > until or self._is_called or self._is_work_waiting:
+                break
+        return done
 
     def _compare(self) -> bool:
         """Add samples to the reference of one window, in turn."""

@@ -23,13 +23,15 @@ from experiments.performance.viewer.browser import Browser, Window, viewer
 from experiments.performance.viewer.load import viewer_memory
 from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
 from mitsuba_irrcache.view.picture import KINDS
+from mitsuba_irrcache.view.session import TARGET_ERROR
 from mitsuba_irrcache.view.slice_panel import ALL, AXES, NONE, THIS
 
 #: Maximum number of windows.
 MOST_WINDOWS = 3
 SIZE = (800, 400)
-#: Seconds until the memory of an image that is final has been released.
-REST = 3.0
+#: Target error [%] of windows at rest, which dense media reach within seconds, and seconds until
+#: the memory of a final image has been released.
+REST_TARGET, REST = 50, 3.0
 
 
 @dataclass
@@ -57,7 +59,7 @@ class User:
 
     def __init__(self, browser: Browser, address: str, rng: np.random.Generator) -> None:
         self._browser, self._address, self._rng = browser, address, rng
-        self.usage = Usage()
+        self.usage, self.began = Usage(), time.monotonic()
         self.windows = [browser.open(address, SIZE)]
         self.windows[0].wait_for("per pixel")
         self._actions = {
@@ -162,14 +164,19 @@ class User:
             self.windows.remove(window)
 
     def rest(self) -> None:
-        """Close all windows but one, and wait for its final image."""
+        """Close all windows but one, and wait for an image that is final with a larger target."""
         while len(self.windows) > 1:
             self.close(self.windows[-1])
         (window,) = self.windows
         window.choose("compare", COMPARISONS[0])
         window.choose("show", KINDS[0])
-        window.wait_for("final")
+        label = "target error %"
+        fields = unfolded(window, "Scattering and error", label)
+        fields.enter(label, str(REST_TARGET))
+        window.wait_until_final()
         time.sleep(REST)
+        self.usage.at_rest.append((time.monotonic() - self.began, viewer_memory()))
+        fields.enter(label, str(100 * TARGET_ERROR))
 
     def leave(self, window: Window) -> None:
         """Record the errors of a window, and close it."""
@@ -190,13 +197,12 @@ def use(browser: Browser, view: list[str], seconds: float, seed: int, log: Path)
     rng = np.random.default_rng(seed)
     with viewer(view, log) as address:
         user = User(browser, address, rng)
-        usage, began = user.usage, time.monotonic()
+        usage, began = user.usage, user.began
         for quarter in range(1, 5):
             while (passed := time.monotonic() - began) < seconds * quarter / 4:
                 usage.memory.append((passed, viewer_memory()))
                 user.act()
             user.rest()
-            usage.at_rest.append((time.monotonic() - began, viewer_memory()))
         for window in user.windows:
             user.leave(window)
     said = log.read_text()

@@ -313,6 +313,19 @@ def test_fine_voxels_precede_further_samples_and_volpath(session, monkeypatch):
     assert during and not any(during)
 
 
+def test_an_image_at_rest_is_antialiased_while_the_solver_continues(session, monkeypatch):
+    """A pass of the solver takes seconds in dense media, and its result begins the image anew: with
+    one sample after each pass images had a single sample per pixel for minutes.
+    """
+    monkeypatch.setattr(sessions, "GROWTH", 1.0)
+    monkeypatch.setattr(sessions, "PICTURE_SHARE", 1e6)  # passes are short here
+    session.target_error = 1e-9
+    screen = Screen()
+    session.look(session.open(screen.show), View(front(session), SIZE))
+    shown = screen.wait(lambda picture: picture.samples == windows.SAMPLES)
+    assert not shown.final
+
+
 def test_each_edit_is_displayed_while_others_wait(session, monkeypatch):
     """While the sun is dragged, an edit always waits; nevertheless each one is displayed, coarsely.
 
