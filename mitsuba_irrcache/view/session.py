@@ -41,6 +41,8 @@ CHECK_SECONDS = 0.02
 EDIT_SECONDS = 0.5
 #: Seconds of an image at rest that follow a pass of the solver, in units of that pass.
 PICTURE_SHARE = 0.5
+#: Seconds without work after which unused memory is released: the next edit allocates it again.
+IDLE_SECONDS = 2.0
 #: (width, height) of an image that is displayed until windows have cameras of their own. It is
 #: wider than most windows; they crop it.
 FIRST_LOOK = (480, 240)
@@ -80,6 +82,7 @@ class Session:
         self._shown: Light | None = None  # displayed; the previous caches until new ones exist
         self._shown_samples = 0
         self._holds_previous = False  # whether windows may still hold the previous caches
+        self._holds_unused = False  # whether there was work since unused memory was released
         self._edited = -np.inf  # time of the last edit
         self._revision = 0  # number of the displayed state, counted across edits
         self._checked = 0.0
@@ -208,12 +211,12 @@ class Session:
             try:
                 # Read before the step: a camera may come to rest during it.
                 rest = self._until_rest
-                if not self._step():
+                if self._step():
+                    self._holds_unused = True
+                else:
                     if self._tasks and rest is None:
                         rest = CHECK_SECONDS  # they wait for an image
-                    with self._news:
-                        if not (self._is_called or self._closed or self._is_work_waiting):
-                            self._news.wait(rest)
+                    self._wait(rest)
             except Superseded:
                 continue
             except Exception as error:
@@ -221,6 +224,23 @@ class Session:
                 self._give_up(error)
         self._light = self._shown = None
         self._windows.clear()
+
+    def _wait(self, seconds: float | None) -> None:
+        """Wait for work, at most for these ``seconds``; without work, release unused memory."""
+        is_idle = seconds is None and self._holds_unused
+        with self._news:
+            if self._is_called or self._closed or self._is_work_waiting:
+                return
+            if self._news.wait(IDLE_SECONDS if is_idle else seconds) or not is_idle:
+                return
+        self._release_memory()
+        self._holds_unused = False
+
+    @staticmethod
+    def _release_memory() -> None:
+        """Release arrays that nothing refers to, and those that Dr.Jit retains for reuse."""
+        gc.collect()  # media with surfaces are part of reference cycles
+        dr.flush_malloc_cache()
 
     def _give_up(self, error: Exception) -> None:
         """Cancel what failed; it is retried only after a new edit or view."""
@@ -356,8 +376,7 @@ class Session:
         self._holds_previous = False
         for window in list(self._windows):
             window.release_others(self._shown)
-        gc.collect()  # media with surfaces are part of reference cycles
-        dr.flush_malloc_cache()
+        self._release_memory()
 
     def _publish_status(self, message: str = "") -> None:
         self.status = Status.of(self._light or self._shown, self._wants_light, message)

@@ -23,7 +23,7 @@ from experiments.performance.viewer.browser import Browser, Window, viewer
 from experiments.performance.viewer.load import viewer_memory
 from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
 from mitsuba_irrcache.view.picture import KINDS
-from mitsuba_irrcache.view.session import TARGET_ERROR
+from mitsuba_irrcache.view.session import IDLE_SECONDS, TARGET_ERROR
 from mitsuba_irrcache.view.slice_panel import ALL, AXES, NONE, THIS
 
 #: Maximum number of windows.
@@ -31,7 +31,7 @@ MOST_WINDOWS = 3
 SIZE = (800, 400)
 #: Target error [%] of windows at rest, which dense media reach within seconds, and seconds until
 #: the memory of a final image has been released.
-REST_TARGET, REST = 50, 3.0
+REST_TARGET, REST = 50, 2 * IDLE_SECONDS
 
 
 @dataclass

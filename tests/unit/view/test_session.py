@@ -326,6 +326,32 @@ def test_an_image_at_rest_is_antialiased_while_the_solver_continues(session, mon
     assert not shown.final
 
 
+def test_an_idle_session_releases_unused_memory_once(session, monkeypatch):
+    """Arrays of the solver that Dr.Jit retains for reuse were as large as twice all others."""
+    monkeypatch.setattr(sessions, "IDLE_SECONDS", 0.01)
+    released: list[Picture] = []
+    screen = Screen()
+
+    def release() -> None:
+        released.append(screen.pictures[-1])
+
+    session.look(session.open(screen.show), View(front(session), SIZE))
+    screen.wait(final)
+    while session._holds_unused:
+        time.sleep(0.01)
+    monkeypatch.setattr(session, "_release_memory", release)
+    for density in (2.0, 3.0):
+        count = len(released)
+        session.edit(lambda document, density=density: document.set_density(density))
+        deadline = time.monotonic() + PATIENCE
+        # The first call follows the first image of the new caches.
+        while len(released) < count + 2 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert released[-1].final
+        time.sleep(0.1)
+        assert len(released) == count + 2
+
+
 def test_each_edit_is_displayed_while_others_wait(session, monkeypatch):
     """While the sun is dragged, an edit always waits; nevertheless each one is displayed, coarsely.
 
