@@ -29,6 +29,7 @@ from mitsuba_irrcache.view.slice_panel import ALL, AXES, NONE, THIS
 #: Maximum number of windows.
 MOST_WINDOWS = 3
 SIZE = (800, 400)
+PRESETS = ("ct-bone", "ct-chest")
 #: Target error [%] of windows at rest, which dense media reach within seconds, and seconds until
 #: the memory of a final image has been released.
 REST_TARGET, REST = 50, 2 * IDLE_SECONDS
@@ -136,7 +137,7 @@ class User:
 
     def preset(self, window: Window) -> None:
         """Select a preset of the transfer function."""
-        window.choose("preset", str(self._rng.choice(["ct-bone", "ct-chest"])))
+        window.choose("preset", str(self._rng.choice(PRESETS)))
 
     def save(self, window: Window) -> None:
         """Save all kinds of files."""
@@ -164,15 +165,20 @@ class User:
             self.windows.remove(window)
 
     def rest(self) -> None:
-        """Close all windows but one, and wait for an image that is final with a larger target."""
+        """Close all windows but one, and wait for an image of the same matter each time that is
+        final with a larger target.
+        """
         while len(self.windows) > 1:
             self.close(self.windows[-1])
         (window,) = self.windows
         window.choose("compare", COMPARISONS[0])
         window.choose("show", KINDS[0])
+        window.choose("preset", PRESETS[0])
         label = "target error %"
         fields = unfolded(window, "Scattering and error", label)
+        fields.enter("density, ×", "1")
         fields.enter(label, str(REST_TARGET))
+        time.sleep(REST)  # the edits begin
         window.wait_until_final()
         time.sleep(REST)
         self.usage.at_rest.append((time.monotonic() - self.began, viewer_memory()))
