@@ -4,8 +4,9 @@
 A browser drags, zooms, edits, saves, reloads, compares, and opens and closes further windows, at
 random from a seed. Records the memory of the viewer, second by second, the actions, and the errors:
 tracebacks in its log, errors in the browsers' consoles. Memory depends on the number of windows and
-on what they do; hence it is also measured after each quarter of the time with a single window that
-shows a final image without a comparison.
+on what they do, and on the transfer function, which determines the voxels of the cache; hence it is
+also measured after each quarter of the time with a single window that shows a final image of the
+same matter.
 """
 
 from __future__ import annotations
