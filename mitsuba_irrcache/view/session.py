@@ -31,7 +31,7 @@ from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
 LOG = logging.getLogger(__name__)
 
 #: Images are rendered anew once the samples per voxel exceed those displayed by this factor.
-GROWTH = 1.25
+GROWTH = 1.5
 #: Default relative standard error of the caches at which refinement stops.
 TARGET_ERROR = 0.005
 #: Seconds between two checks for moved cameras while the solver runs.

@@ -41,7 +41,7 @@
           <button data-id="remove" title="remove the selected point (Delete)">remove</button>
           <button data-id="undo" title="Ctrl+Z">undo</button>
           <button data-id="redo" title="Ctrl+Shift+Z">redo</button>
-          <button data-id="whole" title="the axis shows all values; also by a double click on it">zoom out</button>
+          <button data-id="whole" title="the axis shows all values; also by a double click on it">fit</button>
           <button data-id="load" title="a transfer function as JSON, from a file">load</button>
           <button data-id="save" title="JSON, for irrcache import">save</button>
         </div>
