@@ -42,7 +42,7 @@ EDIT_SECONDS = 0.5
 #: Seconds of an image at rest that follow a pass of the solver, in units of that pass.
 PICTURE_SHARE = 0.5
 #: Seconds without work after which unused memory is released: the next edit allocates it again.
-IDLE_SECONDS = 2.0
+IDLE_SECONDS = 10.0
 #: (width, height) of an image that is displayed until windows have cameras of their own. It is
 #: wider than most windows; they crop it.
 FIRST_LOOK = (480, 240)

@@ -33,7 +33,7 @@ SIZE = (800, 400)
 PRESETS = ("ct-bone", "ct-chest")
 #: Target error [%] of windows at rest, which dense media reach within seconds, and seconds until
 #: the memory of a final image has been released.
-REST_TARGET, REST = 50, 2 * IDLE_SECONDS
+REST_TARGET, REST = 50, 1.2 * IDLE_SECONDS
 
 
 @dataclass
