@@ -15,6 +15,8 @@ from mitsuba_irrcache.view.reference import ViewReference
 KINDS = ("off", "swipe", "error")
 #: Their names in the panel.
 CHOICES = {"off": "off", "swipe with volpath": "swipe", "error against volpath": "error"}
+#: Caption until the reference has its first sample.
+WAITING = "volpath: waiting for its first sample"
 #: Pixels of the window per pixel of the reference and side: the first one is used until the time of
 #: a pass is known, then the finest with which a pass takes at most `PASS_SECONDS`.
 COARSENESS = (4, 2, 1)

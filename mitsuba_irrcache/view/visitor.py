@@ -19,7 +19,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.display import TONES, linear
 from mitsuba_irrcache.view.camera import NARROWEST, WIDEST, Camera
 from mitsuba_irrcache.view.channel import Channel
-from mitsuba_irrcache.view.comparison import CHOICES, Compared, described
+from mitsuba_irrcache.view.comparison import CHOICES, WAITING, Compared, described
 from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.export_panel import ExportPanel
 from mitsuba_irrcache.view.picture import CAPTIONS, EXPOSURES, KINDS, MARKED, Look
@@ -237,7 +237,7 @@ class Visitor:
         """Replace the captions of the comparison before, until the first image of the new one."""
         found = {"mode": "off"}
         if compared != "off":
-            found = described(Compared(compared, "volpath: waiting for its first sample"))
+            found = described(Compared(compared, WAITING))
         self._channel.send("comparison", found, self._key)
 
     def _show(self, picture: Picture) -> None:

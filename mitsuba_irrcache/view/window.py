@@ -9,7 +9,7 @@ from time import monotonic, perf_counter
 import numpy as np
 
 from mitsuba_irrcache.view.camera import Camera
-from mitsuba_irrcache.view.comparison import Compared, Comparison
+from mitsuba_irrcache.view.comparison import WAITING, Compared, Comparison
 from mitsuba_irrcache.view.light import CacheSnapshot, Light
 from mitsuba_irrcache.view.picture import Look, Samples
 
@@ -240,7 +240,7 @@ class Window:
             return Picture(pixels, view, count, False, final)
         known = self._comparison_of(self._light, view)
         if known is None:
-            state = Compared(view.compared, "volpath: waiting for its first sample")
+            state = Compared(view.compared, WAITING)
             return Picture(pixels, view, count, False, False, state)
         image = self.samples.image(view.look.filtered)
         look = replace(view.look, kind="image")

@@ -315,7 +315,7 @@ def test_fine_voxels_precede_further_samples_and_volpath(session, monkeypatch):
 
 def test_an_image_at_rest_is_antialiased_while_the_solver_continues(session, monkeypatch):
     """A pass of the solver takes seconds in dense media, and its result begins the image anew: with
-    one sample after each pass images had a single sample per pixel for minutes.
+    one sample after each pass images had a single sample per pixel for a minute.
     """
     monkeypatch.setattr(sessions, "GROWTH", 1.0)
     monkeypatch.setattr(sessions, "PICTURE_SHARE", 1e6)  # passes are short here
@@ -337,7 +337,8 @@ def test_an_idle_session_releases_unused_memory_once(session, monkeypatch):
 
     session.look(session.open(screen.show), View(front(session), SIZE))
     screen.wait(final)
-    while session._holds_unused:
+    deadline = time.monotonic() + PATIENCE
+    while session._holds_unused and time.monotonic() < deadline:
         time.sleep(0.01)
     monkeypatch.setattr(session, "_release_memory", release)
     for density in (2.0, 3.0):
