@@ -22,7 +22,11 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import directions_of
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import interleaved_channels
-from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
+from mitsuba_irrcache.solvers.discrete_ordinates.moments import (
+    DIFFUSING,
+    AnisotropicMultigridLevel,
+    Moments,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
@@ -147,6 +151,11 @@ class IsotropicScattering:
         ``scale`` is the scattering coefficient divided by 4 pi.
         """
         return [scale * components[0]]
+
+    def source(self, level: MultigridLevel, scattered: Components) -> Components:
+        """Return the components of the source of a sweep, given those of scattered radiance."""
+        first = [level.antidiffused_layer(values) for values in scattered[:DIFFUSING]]
+        return [*first, *scattered[DIFFUSING:]]
 
     def product(self, fluence: Components, adjoint: Components) -> mi.Float:
         """Return the integral over directions of scattered radiance times opposite importance.

@@ -142,7 +142,7 @@ class FluenceTangent:
             return source
         if not (number or transport.single):
             scale = transport.albedo[channel] * dr.inv_four_pi
-            source = scattering.scattered(self._phi[channel], scale)
+            source = scattering.source(level, scattering.scattered(self._phi[channel], scale))
         dr.eval(source)
         tracks = level.tracks
         table = tracks.table(directions, incoming, weights, offsets)
@@ -174,6 +174,8 @@ class FluenceTangent:
             scale = self._extinction[channel] * transport.albedo[channel]
             own = scattering.scattered_by(phi, scale * tangents.g, transport.neighbours.moments)
             source = own if source is None else _sum(source, own)
+        if source is not None:
+            source = self._antidiffused(level, source)
         if tangents.emitted:
             own = scattering.isotropic(tangents.emitted[channel])
             source = own if source is None else _sum(source, own)
@@ -187,6 +189,16 @@ class FluenceTangent:
             return scattering.along(level, source, group)
 
         return self._collided(level, table, along, "uniform", lambda group: group)
+
+    def _antidiffused(self, level: MultigridLevel, emitted: Components) -> Components:
+        """Apply `scattering.source` to radiance per length instead of per optical depth."""
+        sigma_t = level.sigma_t
+        sources = [dr.select(sigma_t > 0, values / sigma_t, 0) for values in emitted]
+        found = self._transport.scattering.source(level, sources)
+        return [
+            dr.select(sigma_t > 0, sigma_t * source, values)
+            for source, values in zip(found, emitted, strict=True)
+        ]
 
     def _collided(
         self,

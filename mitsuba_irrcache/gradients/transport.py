@@ -209,14 +209,15 @@ class AdjointTransport:
             if self.single:
                 found = [self._zeros(scattering.count) for _ in own]
                 if EMISSION in self._wanted:
-                    centres += self._irradiances(level.sweep(source, table)[0], own)
+                    centres += self._irradiances(level.sweep(source, table, True)[0], own)
             else:
-                _, first = level.sweep(source, level.tracks.table(*self.solving))
-                phi = source + level.solve(first, self.solving)
+                # Transposed, antidiffusion follows a sweep instead of preceding it.
+                _, first = level.sweep(source, level.tracks.table(*self.solving), plain=True)
+                phi = source + level.antidiffused(level.solve(first, self.solving))
                 dr.eval(phi)
-                irradiance, phi = level.sweep(phi, table)
+                irradiance, phi = level.sweep(phi, table, plain=True)
                 centres += self._irradiances(irradiance, own)
-                found = scattering.separated(phi, len(own))
+                found = scattering.separated(level.antidiffused(phi), len(own))
             travelled += found
             totals += [
                 scattering.of_parts(camera[c], components)
@@ -249,7 +250,9 @@ class AdjointTransport:
             for c in own:
                 scale = self.albedo[c] * dr.inv_four_pi
                 if SIGMA_T in self._wanted:
-                    source = None if self.single else scattering.scattered(phi[c], scale)
+                    source = None
+                    if not self.single:
+                        source = scattering.source(level, scattering.scattered(phi[c], scale))
                     adjoint = [scattering.scattered(components, scale) for components in totals[c]]
                     sigma_t.append(self._products(level, c, source, adjoint))
                 collided.append(scattering.product(phi[c], travelled[c]))

@@ -41,7 +41,7 @@ def without_forward_peak(medium: MediumGrid) -> MediumGrid:
 
     Radiance scattered into the peak counts as unscattered.
     """
-    # docs/primer, eq. (4.12)
+    # docs/primer, eq. (4.14)
     phase = medium.phase.without_peak()
     scaled, albedo = _scaled(medium, phase.forward)
     exponent = None

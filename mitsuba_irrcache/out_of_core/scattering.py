@@ -26,6 +26,8 @@ from mitsuba_irrcache.out_of_core.survey import MappedField
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.solvers.discrete_ordinates.antidiffusion import Antidiffusion
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
 
 #: Largest number of voxels along a side of the coarse copy.
 COARSE = 128
@@ -138,12 +140,30 @@ class ScatteredIrradiance:
     def _source(self, name: str, before: BrickFile | None) -> BrickFile:
         """Return the scattered radiance per optical depth, in a working file."""
         file = self._sweep.file(name, channels=self._channels)
+        slices, ny, nx = self._grid.shape
         for lower, upper in self._boxes():
-            scattered = self._scattered(lower, upper, before)
-            irradiance = self._uncollided.read(lower, upper).reshape(scattered.shape) + scattered
-            albedo = self._albedo(lower, upper)
-            file.write(lower, irradiance * albedo * np.float32(1 / (4 * np.pi)))
+            # Antidiffusive fluxes need two slices more on either side.
+            first, last = max(lower[0] - 2, 0), min(upper[0] + 2, slices)
+            box = [first, 0, 0], [last, ny, nx]
+            scattered = self._scattered(*box, before)
+            irradiance = self._uncollided.read(*box).reshape(scattered.shape) + scattered
+            source = irradiance * self._albedo(*box) * np.float32(1 / (4 * np.pi))
+            source = self._antidiffused(source, self._sweep.extinction(*box))
+            file.write(lower, source[lower[0] - first : upper[0] - first])
         return file
+
+    def _antidiffused(self, source: np.ndarray, sigma_t: np.ndarray) -> np.ndarray:
+        """Compensate the numerical diffusion of a source (z, y, x, channel) in a box."""
+        *shape, channels = source.shape
+        size = self._grid.voxel_size * np.array(shape[::-1])
+        box = Grid(tuple(shape), np.diag([*size, 1.0]))
+        extinction = mi.Float(np.ascontiguousarray(sigma_t, np.float32).ravel())
+        every = dr.arange(mi.UInt32, box.voxel_count)
+        values = mi.Float(np.ascontiguousarray(source, np.float32).ravel())
+        place, channel = voxel_and_channel(box.voxel_count, channels)
+        compensation = Antidiffusion(box, extinction, every, lambda voxel: voxel)
+        found = compensation.applied(values, place, channels, channel)
+        return np.array(found).reshape(source.shape)
 
     def _boxes(self) -> Iterator[tuple[list[int], list[int]]]:
         """Yield the lower and upper corner (z, y, x) of boxes of slices that fill whole bricks."""

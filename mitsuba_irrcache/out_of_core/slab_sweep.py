@@ -70,7 +70,8 @@ class SlabSweep:
         top, self.is_dense = largest_extinction(self.grid, sigma_t.largest)
         self._levels = self.file(EXTINCTION_FILE, np.uint16)
         write_levels(self._levels, sigma_t, top, memory)
-        self._tracks = SlabTracks(self.grid, top / LEVELS)
+        self._unit = top / LEVELS
+        self._tracks = SlabTracks(self.grid, self._unit)
 
     def file(self, name: str, dtype: np.dtype = np.float32, channels: int = 1) -> BrickFile:
         """Create a working file for values of all voxels."""
@@ -138,8 +139,8 @@ class SlabSweep:
         return total
 
     def extinction(self, lower: list[int], upper: list[int]) -> np.ndarray:
-        """Return the quantised extinction in a box (z, y, x)."""
-        return self._levels.read(lower, upper)
+        """Return the extinction in a box (z, y, x), float32, as it has been quantised."""
+        return self._levels.read(lower, upper) * np.float32(self._unit)
 
     def close(self) -> None:
         """Close the working file of the extinction."""

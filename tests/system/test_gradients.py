@@ -23,6 +23,7 @@ from experiments.validation.gradients.differences import compare, gradients, key
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients import backward
 from mitsuba_irrcache.lights.emitters import EmitterKind
+from mitsuba_irrcache.solvers.discrete_ordinates import multigrid
 
 #: Largest relative error of directional derivatives along smooth perturbations, and the least
 #: cosine; the first also where voxels are empty.
@@ -62,7 +63,9 @@ def test_gradients_in_colour_are_those_of_the_image(rgb, name):
 
 
 @pytest.mark.parametrize("name", ["empty voxels", "no matter", "no matter, sun"])
-def test_empty_voxels_have_gradients(mono, name):
+def test_empty_voxels_have_gradients(mono, monkeypatch, name):
+    # Differences due to the albedo next to empty voxels are smaller than the solver's error.
+    monkeypatch.setattr(multigrid, "COARSEST_TOLERANCE", 1e-6)
     check(CASES[name], EMPTY_ERROR)
 
 

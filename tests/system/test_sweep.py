@@ -94,8 +94,8 @@ def test_white_furnace(scenes, monkeypatch, kind, tolerance):
 
     An optical depth of 50 takes thousands of orders of scattering, which reveals energy that is
     lost or gained by rounding, at borders, or between the levels of the multigrid hierarchy. The
-    bound is 3e-4 if the solution is iterated to convergence (measured: 6e-5), and on average the
-    solver's tolerance.
+    bound is 3e-4 if the solution is iterated to convergence (measured: 6e-5), and on average 1.5
+    times the solver's tolerance.
     """
     if tolerance:
         monkeypatch.setattr(multigrid, "TOLERANCE", tolerance)
@@ -111,7 +111,29 @@ def test_white_furnace(scenes, monkeypatch, kind, tolerance):
     if tolerance:
         np.testing.assert_allclose(phi, 1, atol=3e-4)
     else:
-        assert np.abs(phi - 1).mean() < 1e-3
+        assert np.abs(phi - 1).mean() < 1.5 * multigrid.TOLERANCE
+
+
+@pytest.mark.parametrize("g", [0.0, 0.5])
+def test_the_dark_side_of_a_dense_cloud_does_not_depend_on_the_voxels(scenes, g):
+    """Voxels as large as those of the data conduct as much radiance as smaller ones.
+
+    Without antidiffusion, the dark side is 10 % brighter, with g = 0.5 6 %, than with 3 times as many
+    voxels along each axis.
+    """
+    n = 16
+    place = (np.arange(n) + 0.5) / n * 2 - 1
+    z, y, x = np.meshgrid(place, place, place, indexing="ij")
+    density = np.exp(-4 * (x * x + y * y + z * z)).astype(np.float32)
+    density[density < 0.03] = 0
+    phase = {"type": "hg", "g": g}
+    cloud = scenes.boundary(scenes.medium(20 * density, 0.99, phase=phase))
+    coarse, fine = (
+        values(filled(scenes, cloud, light=sun(0, 0, 1), resolution=r, **batches(4)).irradiance)
+        for r in (n, 3 * n)
+    )
+    dark = np.s_[10:13, 7:9, 7:9]
+    assert coarse[dark].mean() == pytest.approx(fine[1::3, 1::3, 1::3][dark].mean(), rel=0.03)
 
 
 def test_sun_along_an_axis(scenes):

@@ -347,7 +347,7 @@ class ReflectedBoundarySource(BoundarySource):
 
     def update(self, phi: mi.Float | None) -> None:
         """Set the values for a mean irradiance of collisions ``phi`` (None: 0)."""
-        # docs/primer, eq. (4.13)
+        # docs/primer, eq. (4.15)
         values = dr.zeros(mi.Float, dr.width(self._index))
         if phi is not None:
             radiance = self._level.scattered_radiance(phi, self._index, self._direction)

@@ -7,7 +7,7 @@ crosses surfaces between the positions ``first`` and ``last`` of a segment ends 
 restarts at ``last``, with the radiance that leaves the surface there (`boundary_condition`).
 
 The value of a voxel that a surface cuts is that on the side of its centre: only parts of segments
-from which the centre is visible are tallied (eq. (4.14) of docs/primer).
+from which the centre is visible are tallied (eq. (4.16) of docs/primer).
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ class CutVoxelLight:
 
         Behind a surface, it is the radiance at the beginning of the part, which is then attenuated.
         """
-        # docs/primer, eq. (4.15)
+        # docs/primer, eq. (4.17)
         begin, end, voxel, crosses, hidden = crossings.hidden_parts()
         p = dr.lerp(begin, end, rng.next_float32())
         length = dr.norm(end - begin)

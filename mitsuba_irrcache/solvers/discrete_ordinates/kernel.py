@@ -724,7 +724,7 @@ class _PairSweep:
         source: mi.Float,
     ) -> tuple[list, list]:
         """See `_collide_at_surface`."""
-        # docs/primer, eq. (4.14)
+        # docs/primer, eq. (4.16)
         first, last, before, behind, left, voxels = self._crossing(way, slot, slot > 0)
         crosses = first <= last
         lower, upper = (half * self.scale for half in extinction)

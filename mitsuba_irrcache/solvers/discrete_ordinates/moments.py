@@ -19,6 +19,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import concatenated, symbolic
+from mitsuba_irrcache.solvers.discrete_ordinates.antidiffusion import Antidiffusion
 from mitsuba_irrcache.solvers.discrete_ordinates.kernel import collisions
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     block_and_index,
@@ -117,6 +118,10 @@ class Moments:
         return [smooth if found[0] is None else found[0], *found[1:]]
 
 
+#: Number of moments of degrees 0 and 1.
+DIFFUSING = 4
+
+
 class AnisotropicMultigridLevel(MultigridLevel):
     """A `MultigridLevel` whose unknowns are the ``moments``, one after the other."""
 
@@ -164,20 +169,27 @@ class AnisotropicMultigridLevel(MultigridLevel):
         dr.eval(result)
         return result
 
-    def sweep(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
+    def sweep(
+        self, phi: mi.Float | None, table: TrackTable, plain: bool = False
+    ) -> tuple[mi.Float, mi.Float]:
         """Sweep as `MultigridLevel.sweep`, for all moments."""
-        return self._swept(phi, table, with_irradiance=True)
+        return self._swept(phi, table, True, plain)
 
     def collisions(self, phi: mi.Float | None, table: TrackTable) -> mi.Float:
-        return self._swept(phi, table, with_irradiance=False)[1]
+        return self._swept(phi, table, False)[1]
 
     def _swept(
-        self, phi: mi.Float | None, table: TrackTable, with_irradiance: bool
+        self,
+        phi: mi.Float | None,
+        table: TrackTable,
+        with_irradiance: bool,
+        plain: bool = False,
     ) -> tuple[mi.Float | None, mi.Float]:
         """Return the results of `sweep`; the first one is None without ``with_irradiance``."""
         moments, scattered = self.moments, None
         if phi is not None:
-            scattered = self._scattered(phi)
+            flat = self._scattered(phi)
+            scattered = flat if plain else self.antidiffused(flat)
             if table.boundary_source is not None:
                 table.boundary_source.update(phi)
 
@@ -202,6 +214,10 @@ class AnisotropicMultigridLevel(MultigridLevel):
             collided = [a + b for a, b in zip(collided, own, strict=True)]
             if received is not None:
                 received = [a + b for a, b in zip(received, own, strict=True)]
+                voxel_depth = self._voxel_depth(depth)
+                for k in range(min(moments.count, DIFFUSING)):
+                    change = own[k] - moments.moment(flat, k)
+                    received[k] -= Antidiffusion.at_centre(change, voxel_depth)
         return None if received is None else concatenated(received), concatenated(collided)
 
     def source_along(self, scattered: mi.Float | None, group: PairGroup) -> mi.Float:
@@ -234,6 +250,16 @@ class AnisotropicMultigridLevel(MultigridLevel):
         scattered = phi * factor * dr.gather(mi.Float, self.albedo, place)
         dr.eval(scattered)
         return scattered
+
+    def antidiffused(self, values: mi.Float) -> mi.Float:
+        # Diffusion is due to the moments of degrees 0 and 1.
+        moment, place, channel = self._indices(min(self.moments.count, DIFFUSING))
+        begin = moment * dr.opaque(mi.UInt32, self._width) + channel
+        index, result = dr.arange(mi.UInt32, dr.width(place)), dr.copy(values)
+        first = dr.gather(mi.Float, values, index)
+        dr.scatter(result, self._antidiffused(first, place, self.channels, begin), index)
+        dr.eval(result)
+        return result
 
     # Arrays
 

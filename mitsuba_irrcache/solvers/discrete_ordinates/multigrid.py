@@ -29,6 +29,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.anderson import (
     accelerated,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
+from mitsuba_irrcache.solvers.discrete_ordinates.antidiffusion import Antidiffusion
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
@@ -41,7 +42,7 @@ MAX_CYCLES = 12
 THIN = 1e-2
 #: Relative error of the solution on the finest grid; relative changes at which the iteration on the
 #: coarsest grid ends, if that is the only grid, and if it only corrects finer ones.
-TOLERANCE = 2e-3
+TOLERANCE = 1e-3
 COARSEST_TOLERANCE, CORRECTION_TOLERANCE = 2e-4, 3e-2
 #: Maximum number of iterations on the coarsest grid, and of iterates that Anderson acceleration
 #: combines.
@@ -72,6 +73,9 @@ class MultigridLevel:
         self._coarser: MultigridLevel | None = None
         self._tolerance = COARSEST_TOLERANCE
         self._children: list[tuple[mi.UInt32, mi.Float]] = []
+        self._antidiffusion: Antidiffusion | None = None
+        #: whether numerical diffusion is compensated; not among surfaces, which separate voxels
+        self._is_antidiffusive = tracks.surfaces is None
         #: values of voxels that surfaces cut
         self._is_cut: mi.Bool | None = None
         if tracks.surfaces is not None:
@@ -111,6 +115,7 @@ class MultigridLevel:
             dr.eval(sigma_t, self._children)
             self._coarser = self._new_level(sigma_t, self._restricted(self.albedo, tracks), tracks)
             self._coarser._tolerance = CORRECTION_TOLERANCE
+            self._coarser._is_antidiffusive = self._is_antidiffusive
         return self._coarser
 
     def _new_level(self, sigma_t: mi.Float, albedo: mi.Float, tracks: Tracks) -> MultigridLevel:
@@ -177,11 +182,14 @@ class MultigridLevel:
 
     # The operator A
 
-    def sweep(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
+    def sweep(
+        self, phi: mi.Float | None, table: TrackTable, plain: bool = False
+    ) -> tuple[mi.Float, mi.Float]:
         """Compute A phi plus the irradiance due to radiance that enters along the ``table``.
 
-        ``phi`` is a mean irradiance of collisions; None: 0. Returns the irradiance at voxel
-        centres, and the mean irradiance of collisions, which determines the next order.
+        ``phi`` is a mean irradiance of collisions; None: 0. If ``plain``, numerical diffusion is
+        not compensated. Returns the irradiance at voxel centres, and the mean irradiance of
+        collisions, which determines the next order.
         """
         # docs/primer, eq. (4.8)
         tracks = self.tracks
@@ -190,6 +198,8 @@ class MultigridLevel:
         volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * self.channels * 4)
         if phi is not None:
             source = phi * self.albedo * dr.inv_four_pi
+            flat, source = source, source if plain else self.antidiffused(source)
+            change = source - flat
             dr.scatter(volume, mi.Vector4f(source, 0, 0, 0), slot)
             dr.eval(volume)
             if table.boundary_source is not None:
@@ -201,12 +211,33 @@ class MultigridLevel:
         if self._is_cut is not None and tracks.surfaces.medium is not None:
             # Centres of cut voxels may be outside of the medium, where irradiance is not computed.
             irradiance = dr.select(self._is_cut & (depth > 0), collided, irradiance)
+        if phi is not None:
+            irradiance -= 4 * dr.pi * Antidiffusion.at_centre(change, self._voxel_depth(depth))
         collided = self.collided_irradiance(depth, collided, irradiance)
         if self._is_cut is not None:
             # Middles of tracks may lie behind the surface: use the mean over parts of tracks.
             irradiance = dr.select(self._is_cut, collided, irradiance)
         dr.eval(irradiance, collided)
         return irradiance, collided
+
+    def antidiffused(self, values: mi.Float) -> mi.Float:
+        """Apply `Antidiffusion` to a field like phi, unless there are surfaces among the voxels."""
+        place, channel = voxel_and_channel(self.tracks.active_count, self.channels)
+        return self._antidiffused(values, place, self.channels, channel)
+
+    def antidiffused_layer(self, values: mi.Float) -> mi.Float:
+        """Apply `antidiffused` to a single channel of a moment, one value for each voxel."""
+        return self._antidiffused(values, dr.arange(mi.UInt32, self.tracks.active_count), 1, 0)
+
+    def _antidiffused(
+        self, values: mi.Float, place: mi.UInt32, step: int, begin: mi.UInt32 | int
+    ) -> mi.Float:
+        if not self._is_antidiffusive:
+            return values
+        if self._antidiffusion is None:
+            active = self.tracks.active, self.tracks.active_index
+            self._antidiffusion = Antidiffusion(self.grid, self.sigma_t, *active)
+        return self._antidiffusion.applied(values, place, step, begin)
 
     def collisions(self, phi: mi.Float | None, table: TrackTable) -> mi.Float:
         """Return the second result of `sweep`."""
@@ -223,9 +254,12 @@ class MultigridLevel:
         the tracks of suns and of the quadrature pass through different extinction, so that loss
         over depth is unreliable, while the irradiance is nearly constant.
         """
-        size = float(self.grid.voxel_size.min()) / (4 * np.pi * THIN)
-        found = dr.square(depth * dr.opaque(mi.Float, size))
+        found = dr.square(self._voxel_depth(depth) * dr.opaque(mi.Float, 1 / THIN))
         return dr.select(found < 1, dr.lerp(irradiance, collided, found), collided)
+
+    def _voxel_depth(self, depth: mi.Float) -> mi.Float:
+        """Return the optical depth of the shortest edge of voxels, given the sum W of eq. (4.7)."""
+        return depth * dr.opaque(mi.Float, float(self.grid.voxel_size.min()) / (4 * np.pi))
 
     def scattered_radiance(
         self, phi: mi.Float, index: mi.UInt32, direction: mi.Vector3f | None

@@ -111,7 +111,9 @@ def test_skipping_does_not_change_the_radiance(monkeypatch, box, detailed):
             table = each.table(directions, light, np.full(12, 0.5), offsets)
             found.append([np.array(v) for v in level.sweep(phi, table)])
         for all_voxels, some in zip(*found, strict=True):
-            np.testing.assert_allclose(all_voxels, some, rtol=2e-6)
+            # Antidiffusive fluxes make some values almost cancel.
+            rounding = 1e-8 * np.abs(all_voxels).max()
+            np.testing.assert_allclose(all_voxels, some, rtol=2e-6, atol=rounding)
 
 
 def _dilated(mask: np.ndarray, by: int) -> np.ndarray:
