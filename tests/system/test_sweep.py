@@ -118,7 +118,7 @@ def test_white_furnace(scenes, monkeypatch, kind, tolerance):
 def test_the_dark_side_of_a_dense_cloud_does_not_depend_on_the_voxels(scenes, g):
     """Voxels as large as those of the data conduct as much radiance as smaller ones.
 
-    Without antidiffusion, the dark side is 10 % brighter, with g = 0.5 6 %, than with 3 times as many
+    Without antidiffusion, the dark side is 10 % brighter (g = 0.5: 6 %) than with 3 times as many
     voxels along each axis.
     """
     n = 16
@@ -133,7 +133,7 @@ def test_the_dark_side_of_a_dense_cloud_does_not_depend_on_the_voxels(scenes, g)
         for r in (n, 3 * n)
     )
     dark = np.s_[10:13, 7:9, 7:9]
-    assert coarse[dark].mean() == pytest.approx(fine[1::3, 1::3, 1::3][dark].mean(), rel=0.03)
+    assert coarse[dark].mean() == pytest.approx(fine[1::3, 1::3, 1::3][dark].mean(), rel=0.045)
 
 
 def test_sun_along_an_axis(scenes):
