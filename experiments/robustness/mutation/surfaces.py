@@ -99,8 +99,8 @@ SURFACES = (
     Mutant(
         "the adjoint lacks what camera rays leave in the voxel itself",
         "gradients/transport.py",
-        "phi = source + level.solve(first, self.solving)",
-        "phi = level.solve(first, self.solving)",
+        "phi = source + level.antidiffused(level.solve(first, self.solving))",
+        "phi = level.antidiffused(level.solve(first, self.solving))",
         (GRADIENTS,),
     ),
     Mutant(

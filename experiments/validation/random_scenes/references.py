@@ -24,8 +24,10 @@ TARGET, MEAN_NOISE = 0.0025, 0.01 / 3
 PILOT_SPP, PILOTS = 16, 4
 #: Least and largest samples per pixel of a batch (the latter bounds memory), and least batches.
 BATCH_SPP, BATCHES = (32, 2048), 24
-#: `rr_depth` of references; the first one also where the other is not tried.
-ROULETTE = (50, 5)
+#: `rr_depth` of references; the first one also where the other is not tried. In white media it is
+#: NO_ROULETTE: a path survives Russian roulette with a probability of .95 at most, so that the
+#: weights of long paths grow, and a few of large weight can be missing from the mean and its noise.
+ROULETTE, NO_ROULETTE = (50, 5), 1000
 
 
 def load(case: RandomScene, integrator: str, folder: Path, **settings) -> mi.Scene:
@@ -130,11 +132,15 @@ def _begin(case: RandomScene, folder: Path) -> Reference:
     each collision there, and a few of large weight can be missing from its mean and its noise.
     """
     names = ("volpathmis",) if case.is_chromatic else ("volpath",)
-    candidates = [(name, ROULETTE[0]) for name in names]
-    if case.max_depth < 0 and case.depth >= 5:
+    is_white = case.albedo in ("1", "0.99")
+    candidates = [(name, NO_ROULETTE if is_white else ROULETTE[0]) for name in names]
+    if case.max_depth < 0 and case.depth >= 5 and not is_white:
         candidates += [(name, ROULETTE[1]) for name in names]
     pilots = {(name, rr): pilot(load(case, name, folder, rr_depth=rr)) for name, rr in candidates}
-    judge, rr_depth = min(pilots, key=lambda key: pilots[key][0] * pilots[key][1])
+    # Relative to the mean, which is small where paths of large weight are missing.
+    judge, rr_depth = min(
+        pilots, key=lambda k: pilots[k][0] * pilots[k][1] / max(pilots[k][2], 1e-30) ** 2
+    )
     variance, _, mean = pilots[judge, rr_depth]
     wanted = variance / max(TARGET * mean, 1e-12) ** 2 / PIXELS**2
     return Reference(judge, rr_depth, int(np.clip(wanted / BATCHES, *BATCH_SPP)))
