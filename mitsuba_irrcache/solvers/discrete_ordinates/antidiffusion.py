@@ -25,7 +25,7 @@ import mitsuba as mi
 from mitsuba_irrcache.grids.grid import Grid
 
 #: Coefficients of 1 / c = CONSTANT + SLOPE tau, which is within 2 % of the exact value for optical
-#: depths tau up to 6 of a cubic voxel, and within 8 % of any larger one.
+#: depths tau up to 6 of a cubic voxel; deeper voxels are hardly compensated (OPAQUE).
 CONSTANT, SLOPE = 10.25, 3.4
 #: Part of the mean square displacement per collision that may be compensated. Along few ordinates
 #: and tracks, the displacement of single voxels is less than the mean, and more would make the
