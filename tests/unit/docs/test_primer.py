@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from math import log2
 from pathlib import Path
 
 import pytest
@@ -134,6 +135,17 @@ CONSTANTS = [
             grid_size.OPAQUE_POWER,
             grid_size.MOST_PER_DATA_VOXEL,
         ),
+    ),
+    (
+        "7-defaults",
+        r"; up to (\d+) where \$d_v > (\d+)\$",
+        (grid_size.MOST_PER_OPAQUE_VOXEL, grid_size.VERY_OPAQUE),
+    ),
+    ("7-defaults", r"\\epsilon_B\$ exceeds (\d+) %", (grid_size.LARGE_BORDER_ERROR,)),
+    (
+        "7-defaults",
+        r"at most \$2\^\{(\d+)\}\$ voxels .*, \$2\^\{(\d+)\}\$ where that is finer",
+        (log2(grid_size.MOST_VOXELS), log2(grid_size.MOST_REFINED)),
     ),
     (
         "7-defaults",

@@ -56,8 +56,8 @@ def test_small_grids_get_more_voxels(shape):
 
 
 def test_dense_grids_are_refined_by_optical_depth():
-    """Dense grids are refined per axis by the optical depth, by a factor of eight at most,
-    which is even from four on.
+    """Dense grids are refined per axis by the optical depth, by a factor of eight at most, which
+    is even from four on; opaque ones by ten.
 
     For ``path`` they are not, since its noise exceeds the discretisation error.
     """
@@ -66,8 +66,10 @@ def test_dense_grids_are_refined_by_optical_depth():
     assert dense == (64, 64, 64)  # 1 / 0.7 for each data voxel would be 57
     assert chosen(in_air(40, 48.0)) == (68, 68, 68)
     assert chosen(in_air(40, 40.0 * 1.2 * 4)) == (127, 127, 127)  # 4^0.45 times as many
-    assert opaque == (256, 256, 256)
-    assert chosen(in_air(20, 20000.0)) == (160, 160, 160)
+    assert chosen(in_air(40, 40 * 59.0)) == (256, 256, 256)  # 2^24 voxels
+    assert opaque == (322, 322, 322)  # 2^25
+    assert chosen(in_air(20, 20 * 59.0)) == (160, 160, 160)
+    assert chosen(in_air(20, 20000.0)) == (200, 200, 200)
     assert chosen(in_air(40, 40000.0), solver="path") == (40, 40, 40)
     assert chosen(np.full((4, 4, 4), 500.0), solver="path") == (32, 32, 32)
     assert chosen(np.full((1, 1, 1), 1.0), solver="path") == (16, 16, 16)
@@ -104,7 +106,9 @@ def test_resolution_depends_on_where_collisions_happen():
 
 def test_finer_voxels_have_a_limit(monkeypatch):
     monkeypatch.setattr(grid_size, "MOST_REFINED", 70000)
-    assert chosen(in_air(40, 40000.0)) == (41, 41, 41)
+    assert chosen(in_air(40, 40 * 59.0)) == (41, 41, 41)
+    monkeypatch.setattr(grid_size, "MOST_IN_OPAQUE_DATA", 80000)
+    assert chosen(in_air(40, 40000.0)) == (43, 43, 43)
     monkeypatch.setattr(grid_size, "MOST_VOXELS", 30000)
     assert chosen(in_air(40, 40000.0)) == (31, 31, 31)
 
@@ -181,7 +185,8 @@ def test_directions_by_default(scenes):
     [
         (64, 20.0, -1, True),  # 5 voxels for each 4 of the data
         (64, 20.0, 2, False),
-        (16, 100.0, -1, True),  # 8 voxels along each data voxel, of depth 12
+        (16, 150.0, -1, True),  # 10 voxels along each data voxel, of depth 15
+        (16, 80.0, -1, False),  # of depth 8
         (16, 30.0, -1, False),  # 6 voxels, of depth 5
         (64, 2.0, -1, False),
     ],
@@ -202,6 +207,21 @@ def specks(count: int, sigma_t: float) -> np.ndarray:
     """Return single dense voxels in air."""
     rng = np.random.default_rng(3)
     return np.where(rng.random((count,) * 3) < 0.004, sigma_t, 0.0)
+
+
+def test_the_border_is_as_dense_as_the_densest_channel():
+    """Blue matter is as opaque at its boundary as grey matter of the same maximum."""
+
+    def error(rgb: list[float]) -> float:
+        frame = np.eye(4)
+        values = mi.Float(np.tile(rgb, 8).astype(np.float32))
+        field = GridField(Grid((2, 2, 2), frame), values, 3)
+        boundary = medium(np.ones((2, 2, 2))).boundary
+        matter = MediumGrid(field, ConstantField(np.array([0.5])), boundary)
+        return grid_size.border_error(matter, Grid((8, 8, 8), frame))
+
+    assert error([0.1, 0.1, 4.0]) == pytest.approx(error([4.0, 4.0, 4.0]))
+    assert error([4.0, 0.1, 0.1]) == pytest.approx(grid_size.BORDER_ERROR * 0.5**1.2)
 
 
 def test_dense_detail_needs_more_voxels():
