@@ -102,9 +102,8 @@ def nodes_of_medium(
     for role, volume in volumes.items():
         for node in (volume, *children(volume).values()):
             if nodes.get(node, role) != role:
-                refuse(
-                    _first_key_of(params, node, keys), f"both {nodes[node]} and {role} depend on it"
-                )
+                reason = f"both {nodes[node]} and {role} depend on it"
+                refuse(key_of_node(params, keys, node), reason)
             nodes[node] = role
     return nodes
 
@@ -118,8 +117,9 @@ def nodes_of_emitters(scene: mi.Scene) -> dict[mi.Object, mi.Emitter]:
     return nodes
 
 
-def _first_key_of(params: mi.SceneParameters, node: mi.Object, keys: list[str]) -> str:
-    return next((key for key in keys if params.properties[key][2] == node), "sigma_t")
+def key_of_node(params: mi.SceneParameters, keys: list[str], node: mi.Object) -> str:
+    """Return the first of ``keys`` that is a parameter of ``node``, or the first of all."""
+    return next((key for key in keys if params.properties[key][2] == node), keys[0])
 
 
 def refuse(key: str, reason: str) -> None:

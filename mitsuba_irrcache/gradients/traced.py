@@ -17,6 +17,7 @@ from mitsuba_irrcache.gradients.parameters import (
     SIGMA_T,
     by_parameter,
     channels_of,
+    key_of_node,
     nodes_of_emitters,
     nodes_of_medium,
     refuse,
@@ -192,7 +193,7 @@ def roles_among(
         own = nodes_of_medium(params, keys, medium)
         for node, role in own.items():
             if isinstance(nodes.get(node), tuple):
-                refuse(_key_of(params, keys, node), "several media depend on it")
+                refuse(key_of_node(params, keys, node), "several media depend on it")
             nodes[node] = number, role
     for shape in scene.shapes():
         if shape.bsdf() is not None:
@@ -213,7 +214,3 @@ def _reflectances(bsdf: mi.BSDF) -> dict[mi.Object, mi.BSDF]:
         return {}
     texture = own["reflectance"]
     return dict.fromkeys((texture, *children(texture).values()), bsdf)
-
-
-def _key_of(params: mi.SceneParameters, keys: list[str], node: mi.Object) -> str:
-    return next((key for key in keys if params.properties[key][2] == node), keys[0])

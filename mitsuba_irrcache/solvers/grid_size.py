@@ -375,7 +375,7 @@ def warn_of_unresolved_detail(medium: MediumGrid, grid: Grid) -> None:
 
 
 def _border_extinction(medium: MediumGrid) -> float:
-    """Return the 95th percentile of sigma_t on the faces of the medium, of the densest channel
+    """Return the 95th percentile of sigma_t on the boundary of the medium, of the densest channel
     [1/scene unit].
     """
     rng = mi.PCG32(4096)
@@ -383,5 +383,6 @@ def _border_extinction(medium: MediumGrid) -> float:
     place = [rng.next_float32() for _ in range(3)]
     side = mi.Float(face % 2)
     u = mi.Point3f([dr.select(face // 2 == axis, side, p) for axis, p in enumerate(place)])
-    sigma_t = medium.sigma_t.at_world(Grid((1, 1, 1), medium.frame).world.point(u))
+    on_box = Grid((1, 1, 1), medium.frame).world.point(u)
+    sigma_t = medium.sigma_t.at_world(medium.boundary.drawn_inside(on_box))
     return float(np.quantile(np.array(dr.max(mi.Spectrum(sigma_t), axis=0)), 0.95))

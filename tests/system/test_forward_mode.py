@@ -12,8 +12,8 @@ from experiments.validation.gradients.differences import (
     compare,
     derivatives,
     directions,
+    first_key,
     gradients,
-    key_of,
     pixel_weights,
 )
 from mitsuba_irrcache.errors import IrrcacheError
@@ -31,7 +31,7 @@ def check(case: Case, difference: float = DIFFERENCE) -> None:
     reverse = gradients(scene, case.parameters, weights)
     for name, gradient in reverse.items():
         params = mi.traverse(scene)
-        value = np.array(params[key_of(params, name)], dtype=np.float64)
+        value = np.array(params[first_key(params, name)], dtype=np.float64)
         steps = directions(case, name, value, PERTURBATIONS)
         forward = derivatives(scene, name, weights, steps)
         expected = [(gradient.reshape(value.shape) * step).sum() for step in steps]
@@ -67,7 +67,7 @@ def test_forward_mode_is_the_difference_of_images(mono):
     case = CASES["sky"]
     scene = case.load()
     weights, params = pixel_weights(scene), mi.traverse(scene)
-    value = np.array(params[key_of(params, "sigma_t")], dtype=np.float64)
+    value = np.array(params[first_key(params, "sigma_t")], dtype=np.float64)
     (step,) = directions(case, "sigma_t", value, 1)
     (found,) = derivatives(scene, "sigma_t", weights, [step])
     result = compare(scene, case, "sigma_t", weights, np.zeros(value.shape), 1)
@@ -80,7 +80,7 @@ def test_forward_mode_is_the_difference_of_images(mono):
 def attached(scene: mi.Scene) -> tuple[mi.SceneParameters, mi.Float, mi.TensorXf]:
     """Parameters whose extinction is multiplied by a factor that carries gradients."""
     params = mi.traverse(scene)
-    key = key_of(params, "sigma_t")
+    key = first_key(params, "sigma_t")
     data, factor = mi.TensorXf(dr.detach(params[key])), mi.Float(1)
     dr.enable_grad(factor)
     params[key] = data * factor
@@ -98,7 +98,7 @@ def test_derivatives_of_upstream_variables_reach_the_image(rgb):
     assert found.shape == image.shape
     images = []
     for scale in (0.97, 1.03):
-        params[key_of(params, "sigma_t")] = data * scale
+        params[first_key(params, "sigma_t")] = data * scale
         params.update()
         images.append(np.array(mi.render(scene, spp=64, seed=1)))
     expected = (images[1] - images[0]) / 0.06
@@ -123,10 +123,10 @@ def test_several_views_share_the_solve(rgb, monkeypatch):
 def test_forward_and_reverse_mode_do_not_disturb_each_other(rgb):
     scene = Case(data=8, cache=8).load()
     params, factor, _ = attached(scene)
-    found = []
+    key, found = first_key(params, "sigma_t"), []
     for mode in (dr.backward, dr.forward_to, dr.backward):
         dr.clear_grad(factor)
-        params[key_of(params, "sigma_t")] = dr.detach(params[key_of(params, "sigma_t")]) * factor
+        params[key] = dr.detach(params[key]) * factor
         params.update()
         loss = dr.mean(mi.render(scene, params, spp=16, seed=1))
         if mode is dr.forward_to:

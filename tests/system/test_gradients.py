@@ -19,7 +19,12 @@ from experiments.validation.gradients.cases import (
     sky_with_sun,
     spot,
 )
-from experiments.validation.gradients.differences import compare, gradients, key_of, pixel_weights
+from experiments.validation.gradients.differences import (
+    compare,
+    first_key,
+    gradients,
+    pixel_weights,
+)
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients import backward
 from mitsuba_irrcache.lights.emitters import EmitterKind
@@ -156,7 +161,7 @@ def test_positions_and_directions_of_lights_have_gradients(rgb, kind, max_depth)
 def small(g=None, **properties) -> tuple[mi.Scene, mi.SceneParameters, str]:
     scene = Case(data=8, cache=8, g=g).load(**properties)
     params = mi.traverse(scene)
-    return scene, params, key_of(params, "sigma_t")
+    return scene, params, first_key(params, "sigma_t")
 
 
 def gradient_of(scene, params, key, **options) -> np.ndarray:
@@ -331,7 +336,7 @@ def test_adam_finds_a_density(mono, max_depth):
     scene = case.load()
     target = mi.TensorXf(mi.render(scene, spp=16))
     params = mi.traverse(scene)
-    key = key_of(params, "sigma_t")
+    key = first_key(params, "sigma_t")
     optimizer = mi.ad.Adam(lr=0.05)
     optimizer["density"] = dr.zeros(mi.TensorXf, params[key].shape)
     losses = []
@@ -393,7 +398,7 @@ def test_only_what_is_wanted_is_computed(rgb, monkeypatch):
     )
     gradient_of_colour(scene, params, "sun.irradiance.value")
     assert not calls
-    gradient_of(scene, params, key_of(params, "sigma_t"))
+    gradient_of(scene, params, first_key(params, "sigma_t"))
     assert len(calls) == 1
 
 
@@ -486,7 +491,7 @@ def test_emitters_without_derivatives_are_refused_by_name(rgb, monkeypatch):
 def test_emission_of_zero_is_refused(rgb):
     scene = Case(data=8, cache=8, emissive=True).load()
     params = mi.traverse(scene)
-    key = key_of(params, "emission")
+    key = first_key(params, "emission")
     params[key] = dr.zeros(mi.TensorXf, params[key].shape)
     params.update()
     assert "the emission is 0 everywhere" in refused(scene, "emission.data")

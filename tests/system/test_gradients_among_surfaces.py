@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from experiments.validation.gradients.cases import SURROUNDED, Case, distant, ground
-from experiments.validation.gradients.differences import compare, gradients, key_of, pixel_weights
+from experiments.validation.gradients.differences import (
+    compare,
+    first_key,
+    gradients,
+    pixel_weights,
+)
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients import surroundings
 
@@ -73,7 +78,7 @@ def test_a_distant_object_changes_nothing(mono):
 def attached(case: Case, name: str = "sigma_t") -> tuple[mi.Scene, mi.SceneParameters, str]:
     scene = case.load()
     params = mi.traverse(scene)
-    key = key_of(params, name)
+    key = first_key(params, name)
     params[key] = type(params[key])(dr.detach(params[key]))
     dr.enable_grad(params[key])
     params.update()
@@ -164,7 +169,7 @@ def test_media_that_lie_within_each_other_are_refused(rgb):
     ball = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "null"}, "interior": inner}
     scene = Case(data=6, cache=6, objects=lambda: {"inner": ball}).load(solver="auto")
     params = mi.traverse(scene)
-    key = key_of(params, "sigma_t")
+    key = first_key(params, "sigma_t")
     dr.enable_grad(params[key])
     params.update()
     with pytest.raises((IrrcacheError, RuntimeError), match="irrcache"):

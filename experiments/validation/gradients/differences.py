@@ -38,7 +38,7 @@ class Comparison:
         return float(self.adjoint @ self.differences / norms)
 
 
-def key_of(params: mi.SceneParameters, name: str) -> str:
+def first_key(params: mi.SceneParameters, name: str) -> str:
     """The key of a parameter of the medium or of another object, part of which is ``name``.
 
     If several fit, it is that of the first medium or of the radiance of an emitter.
@@ -65,7 +65,7 @@ def gradients(
 ) -> dict[str, np.ndarray]:
     """Gradients of the objective by the parameters of these names."""
     params = mi.traverse(scene)
-    keys = {name: key_of(params, name) for name in names}
+    keys = {name: first_key(params, name) for name in names}
     weighted = mi.TensorXf(weights.astype(np.float32))
     found = gradients_of(
         scene,
@@ -87,7 +87,7 @@ def derivatives(
 ) -> np.ndarray:
     """Derivatives of the objective along ``steps`` of a parameter, by forward mode."""
     params = mi.traverse(scene)
-    key, found = key_of(params, name), []
+    key, found = first_key(params, name), []
     kind, shape = type(params[key]), np.array(params[key]).shape
     for step in steps:
         leaf = kind(dr.detach(params[key]))
@@ -141,7 +141,7 @@ def compare(
     where a parameter would become negative.
     """
     params = mi.traverse(scene)
-    key = key_of(params, name)
+    key = first_key(params, name)
     kind, value = type(params[key]), np.array(params[key], dtype=np.float64)
 
     def objective(changed: np.ndarray) -> float:

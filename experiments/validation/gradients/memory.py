@@ -17,7 +17,7 @@ import psutil
 
 from experiments.support.options import begin
 from experiments.validation.gradients.cases import SUN, Case
-from experiments.validation.gradients.differences import key_of
+from experiments.validation.gradients.differences import first_key
 from mitsuba_irrcache.gradients.fit import fit
 from mitsuba_irrcache.gradients.fit_state import Result, Settings, View
 
@@ -44,7 +44,7 @@ def main() -> None:
         sensor = mi.load_dict(own)
         views.append(View(sensor, np.array(mi.render(scene, sensor=sensor, spp=16))))
     params = mi.traverse(scene)
-    key = key_of(params, "sigma_t")
+    key = first_key(params, "sigma_t")
     params[key] = dr.full(mi.TensorXf, 0.3, params[key].shape)
     params.update()
     process = psutil.Process()

@@ -26,8 +26,8 @@ from experiments.validation.gradients.differences import (
     compare,
     derivatives,
     directions,
+    first_key,
     gradients,
-    key_of,
     mean_of,
     pixel_weights,
 )
@@ -119,7 +119,7 @@ def _rows(name: str, case: Case) -> list[list[str]]:
     for parameter, gradient in found.items():
         result = compare(scene, case, parameter, weights, gradient)
         params = mi.traverse(scene)
-        value = np.array(params[key_of(params, parameter)], dtype=np.float64)
+        value = np.array(params[first_key(params, parameter)], dtype=np.float64)
         steps = directions(case, parameter, value, BLOBS)
         forward = replace(
             result, adjoint=derivatives(scene, parameter, weights, steps, case.samples)

@@ -224,6 +224,17 @@ def test_the_border_is_as_dense_as_the_densest_channel():
     assert error([4.0, 0.1, 0.1]) == pytest.approx(grid_size.BORDER_ERROR * 0.5**1.2)
 
 
+def test_the_border_of_a_sphere_is_its_surface():
+    """Matter that ends at a sphere is dense at the boundary, although its box has empty faces."""
+    z, y, x = np.meshgrid(*[(np.arange(64) + 0.5) / 32 - 1] * 3, indexing="ij")
+    values = np.where(x * x + y * y + z * z < 1.03, 8.0, 0.0) * (abs(x) < 0.9)
+    cube = medium(values)
+    sphere = cube.replaced(boundary=Boundary("sphere", cube.boundary.to_world))
+    voxels = Grid((16, 16, 16), np.eye(4))
+    assert grid_size.border_error(cube, voxels) < 0.1 * grid_size.border_error(sphere, voxels)
+    assert grid_size.border_error(sphere, voxels) == pytest.approx(3.5 * 0.5**1.2, rel=0.1)
+
+
 def test_dense_detail_needs_more_voxels():
     """Single dense voxels need more voxels than even matter of the same extinction; thin ones do
     not, nor does `path`, whose noise is larger.
