@@ -56,7 +56,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - rr_depth
        - |int|
        - Depth from which paths of the solver ``path``, and paths between surfaces, are ended by
-         Russian roulette. (Default: 5)
+         Russian roulette. Images that ``volpath`` renders instead of a cache (see ``solver``) use
+         50 unless it is set. (Default: 5)
 
      * - hide_emitters
        - |bool|
@@ -78,11 +79,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
          0: chosen for an estimated error of 0.5 % of the mean radiance (``path``: 1 %): the
-         resolution of the data, up to six times as many voxels along each axis if they are
-         optically thick, at least 32 along the longest side (48 around emitters, ``path``: 16), up
-         to 64 or 128 if the contrast is high or the boundary cuts through dense regions; fewer in
-         smooth data under environments without bright regions; at most 2^25 in total, for ``path``
-         128 along a side, and 32 to 64 with surfaces or several media. An opaque
+         resolution of the data, up to eight times as many voxels along each axis if they are
+         optically thick (ten if opaque), at least 32 along the longest side (48 around emitters,
+         ``path``: 16), up to 64 or 128 if the contrast is high or the boundary cuts through dense
+         regions; fewer in smooth data under environments without bright regions; at most 2^25 in
+         total (2^24 if finer than data that are not opaque, 2^21 with anisotropic scattering), for
+         ``path`` 128 along a side, and 32 to 64 with surfaces or several media. An opaque
          homogeneous medium in a box or sphere has no cache: its radiance is that of a half-space.
          (Default: 0)
 

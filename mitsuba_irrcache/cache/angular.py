@@ -152,8 +152,8 @@ class AngularBasis:
     def gain(
         self, p: mi.Point3f, direction: mi.Vector3f, towards: mi.Vector3f, with_peak: bool = True
     ) -> mi.Float:
-        """Weight, relative to isotropic scattering, of radiance from the direction ``towards``,
-        scattered at ``p`` into ``direction``: 4 pi times the phase function.
+        """Return the weight, relative to isotropic scattering, of radiance from the direction
+        ``towards`` that is scattered at ``p`` into ``direction``: 4 pi times the phase function.
 
         Without ``with_peak`` scattering into a forward peak is excluded.
         """
@@ -267,7 +267,7 @@ def with_radiance(
 
 
 def warn_of_noise(basis: AngularBasis, samples: int, name: str) -> None:
-    """Log a warning if a medium with a forward peak is lit by bright spots of an environment.
+    """Log a warning if bright spots of an environment illuminate a medium with a forward peak.
 
     Radiance scattered out of the forward direction is then a small difference of large values, and
     noisy with ``samples`` directions.

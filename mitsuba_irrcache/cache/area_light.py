@@ -237,7 +237,7 @@ class AreaLight(DirectLight):
     def depth_of(
         self, mean: mi.Float | mi.Color3f, p: mi.Point3f, shift: mi.Vector2f | None = None
     ) -> mi.Float | mi.Color3f:
-        """See the base class."""
+        """Return the optical depth that follows from ``mean``, as `DirectLight.depth_of`."""
         if self._lines != EACH:
             return super().depth_of(mean, p)
         shift = shift_at(p) if shift is None else shift
@@ -246,7 +246,10 @@ class AreaLight(DirectLight):
     def depth_along(
         self, ray: mi.Ray3f, ends: tuple[mi.Float, mi.Float], means: tuple
     ) -> Callable[[mi.Float], mi.Float | mi.Color3f]:
-        """See the base class; a parabola, if depths are averages over points."""
+        """Return the optical depth along segments as `DirectLight.depth_along`.
+
+        It is a parabola if depths are averages over points.
+        """
         depth_at = super().depth_along(ray, ends, means)
         if self._lines != EACH:
             return depth_at
@@ -376,7 +379,7 @@ class AreaLight(DirectLight):
         shift: mi.Vector2f,
         peak_depth: mi.Float | mi.Color3f | None,
     ):
-        """See `mean_residual`, with ``count`` points and the mean extinction ``sigma_t``."""
+        """Average as `mean_residual`, over ``count`` points with mean extinction ``sigma_t``."""
         vertex = dr.zeros(mi.Interaction3f, dr.width(p))
         vertex.p = p
         coloured = isinstance(peak_depth, mi.Color3f)

@@ -33,7 +33,7 @@ NONE = 0xFFFFFFFF
 #: from other nodes.
 LEVELS, INDIRECT_LEVELS = 6, 3
 #: Spacing of the lattice at level 0 over the diagonal of the media's box; distance from the box, in
-#: units of that spacing, beyond which coarser levels than 0 are used.
+#: units of that spacing, at 2^k times which level -k begins, for k > 0.
 COARSEST, COARSER_BEYOND = 0.25, 2.0
 #: Largest spacing over the harmonic mean distance of a node.
 SPACING_PER_DISTANCE = 0.25

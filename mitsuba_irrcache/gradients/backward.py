@@ -69,7 +69,7 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
             refuse_all(
                 keys,
                 f'emitter "{emitter.id()}" ({emitter.class_name()}) is neither an environment nor '
-                "a sun nor a point or spot light",
+                "a sun nor point-like (point, spot or projector)",
                 "Remove it",
             )
     depth = part.settings.max_depth

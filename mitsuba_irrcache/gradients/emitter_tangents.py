@@ -38,8 +38,9 @@ class EmitterTangents:
         return mi.Spectrum(0) if self._environment is None else self._environment.along(-ray.d)
 
     def lights(self, lights: LightsOfOneDirection) -> list[mi.Spectrum]:
-        """Return the changes of the irradiance in all voxels of points and spots, and 0 for suns,
-        whose radiance `incoming` includes.
+        """Return, for each emitter of ``lights``, the change of its irradiance in all voxels.
+
+        It is 0 for suns, whose change `incoming` returns.
         """
         found = []
         pairs = zip(lights.emitters, lights.irradiance, strict=True)

@@ -2,8 +2,9 @@
 
 A path starts at the camera, or in a voxel. It continues from surface to surface; on each segment
 the media add the radiance that they scatter, which their fluence determines, and attenuate what is
-behind. All segments of a path are stored, so that going back along it what is ahead of each of them
-is known (as in path replay backpropagation, Vicini, Speierer and Jakob 2021).
+behind. All segments of a path are stored. Derivatives are computed from its end to its start, so
+that the radiance from behind each segment is known (as in path replay backpropagation, Vicini,
+Speierer and Jakob 2021).
 """
 
 from __future__ import annotations

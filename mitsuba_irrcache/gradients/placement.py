@@ -1,4 +1,4 @@
-"""Derivatives with respect to the positions of points and spots and the directions of suns.
+"""Derivatives with respect to the positions of point lights and the directions of suns.
 
 Where scattering is isotropic, images depend on them through the irradiance in the voxels alone. Its
 change is a central difference: a light that moves by a small step irradiates a position as the

@@ -235,7 +235,7 @@ class CameraReplay:
 
     @symbolic
     def transmittance(self, ray: mi.Ray3f, near: mi.Float, far: mi.Float, active: mi.Bool):
-        """Return the transmittance of rays between two distances, by the same rule."""
+        """Return the transmittance of rays between two distances, by the rule of the radiance."""
         k, t, depth = mi.Float(0), mi.Float(near), mi.Spectrum(0)
         active = mi.Bool(active) & (near < far)
         while dr.hint(active, label="transmittance"):

@@ -133,7 +133,7 @@ class IsotropicScattering:
         return [0] * lights
 
     def from_direction(self, irradiance: mi.Float, towards: mi.Vector3f) -> Components:
-        """Return the components of an ``irradiance`` that arrives from ``towards``, a direction."""
+        """Return the components of an ``irradiance`` from the direction ``towards``."""
         return [irradiance]
 
     def of_parts(self, camera: Components, travelled: Components) -> list[Components]:

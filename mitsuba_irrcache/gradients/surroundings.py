@@ -34,15 +34,15 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 
-#: Paths of a launch, at most; paths from voxels for the derivatives of the radiance that arrives,
-#: and for each exchange with surroundings; directions in which radiance arrives at voxels without
-#: extinction, whose fluence no cache has.
+#: Maximum number of paths of a launch; number of paths from voxels for derivatives through the
+#: irradiance from the surroundings; number for each exchange with the surroundings; number of
+#: directions by which the fluence of voxels without a cached value is estimated.
 LANES, RAYS, EXCHANGED, DIRECTIONS = 1 << 17, 1 << 20, 1 << 18, 64
 #: Largest change of the adjoint fluence by a further exchange, relative to the whole; and number of
 #: exchanges, at most.
 TOLERANCE, MOST_EXCHANGES = 3e-3, 32
-#: Distinguishes random numbers of the camera, of exchanges, derivatives, and empty voxels.
-CAMERA, EXCHANGE, ARRIVAL, ARRIVING = range(4)
+#: Uses of random numbers: camera rays, exchanges, derivatives, fluence of voxels without a cache.
+CAMERA, EXCHANGE, DERIVATIVES, UNCACHED = range(4)
 
 
 class KnownFluence:
@@ -195,7 +195,7 @@ class Surroundings:
             count = min(per_launch, dr.width(unknown) - first)
             place = dr.arange(mi.UInt32, count * DIRECTIONS)
             voxel = dr.gather(mi.UInt32, unknown, place // DIRECTIONS + first)
-            rng = self._random(ARRIVING + number, first, count * DIRECTIONS)
+            rng = self._random(UNCACHED + number, first, count * DIRECTIONS)
             shift = [rng.next_uint32(), rng.next_uint32()]
             shift = [dr.gather(mi.UInt32, s, place // DIRECTIONS) for s in shift]
             u, v = unit_floats(kronecker_words(place % DIRECTIONS, shift))
@@ -251,7 +251,7 @@ class Surroundings:
         splats = None
         for number, values in enumerate(worth):
             for first, rays in self._launches(RAYS, len(self.media)):
-                start = self._from_voxels(number, values, ARRIVAL, first, rays)
+                start = self._from_voxels(number, values, DERIVATIVES, first, rays)
                 if start is None:
                     continue
                 paths = self._paths()
@@ -337,7 +337,7 @@ class Surroundings:
         return Start(ray, irradiance * (4 * dr.pi), None, irradiance, rng)
 
     def _total(self, use: int, parts: int) -> int:
-        return max((RAYS if use == ARRIVAL else EXCHANGED) // parts, 1)
+        return max((RAYS if use == DERIVATIVES else EXCHANGED) // parts, 1)
 
 
 def _norm(media: list[CoupledMedium], fluence: list[list[mi.Float]]) -> float:

@@ -21,7 +21,7 @@ MAX_LAMP_SINE = 0.95
 MIN_ANGULAR_RADIUS = 0.005
 #: Bright spots of an environment: minimum and maximum angular radius.
 MIN_SPOT_RADIUS, MAX_SPOT_RADIUS = float(np.deg2rad(4)), float(np.deg2rad(12))
-#: Their minimum share of the total irradiance (1/400 if it is uniform), and maximum number.
+#: Their minimum share of the total irradiance (1/820 if it is uniform), and maximum number.
 MIN_SPOT_SHARE, MAX_SPOTS = 0.02, 4
 #: Share of the energy within the maximum radius that the radius of a spot must enclose. Energy
 #: outside of it is sampled by few ordinates only, and may still exceed that of the remaining

@@ -94,15 +94,15 @@ def check_emission_is_within(emission: Emission, frames: Sequence[np.ndarray]) -
     """
     if not frames:
         raise IrrcacheError(
-            "irrcache: there is emission, but no medium, and only media emit light. Put a medium "
-            "around it; its sigma_t may be 0."
+            "irrcache: emission is set, but the scene has no medium, and only media have "
+            "volumetric emission. Put a medium around it; its sigma_t may be 0."
         )
     if emission.grid is not None and not any(_overlap(emission.grid, f) for f in frames):
         lower, upper = _box(emission.grid.to_world)
         raise IrrcacheError(
             f"irrcache: the emission fills {lower} to {upper}, where there is no medium, and only "
-            "media emit light. Place it by its to_world in world space, or put a medium around it; "
-            "its sigma_t may be 0."
+            "media have volumetric emission. Place it by its to_world in world space, or put a "
+            "medium around it; its sigma_t may be 0."
         )
 
 

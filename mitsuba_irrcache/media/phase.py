@@ -26,7 +26,7 @@ from mitsuba_irrcache.media.aureole import PEAK_MOMENTS, Aureole
 #: peak.
 MAX_ORDER, MAX_TRUNCATED_ORDER = 4, 6
 #: Maximum energy fraction of a truncated forward peak for orders 4 and 5, and for order 6. For
-#: ``hg`` these correspond to g = 0.75 and g = 0.85.
+#: ``hg`` they allow g up to 0.75 (order 4), 0.79 (5) and 0.85 (6).
 PEAK, LARGEST_PEAK = 0.25, 0.33
 #: Magnitude below which moments g_l are neglected, and the magnitude that neglected moments may
 #: have at most with `MAX_ORDER`, which for ``hg`` limits |g| to 0.58. In a uniform environment, on

@@ -68,7 +68,7 @@ class CacheSettings:
 
 class CachedMedium:
     """A medium with its cache, which is None before `start`, and if none is needed (``max_depth``
-    below 2, or a closed form).
+    0 or 1, or a closed form).
 
     Args:
         solver: result of `choose_solver`.
@@ -217,7 +217,7 @@ class CachedMedium:
             medium, settings.max_depth, dr.width(active)
         )
         if basis is not None:
-            name = self.label + f'medium "{medium.name}"'
+            name = f'medium "{medium.name}"'
             warn_of_noise(basis, samples, name)
             reason = self._why_shadows_are_too_bright()
             if reason is not None:
@@ -282,7 +282,7 @@ class CachedMedium:
         classes = self.solver.voxel_classes(scene, self.description.media, medium, grid, active)
         if classes is not None:
             active = dr.compress(classes.readable & marked(grid, active))
-        if medium.albedo.maximum == 0 or not self._is_lit:
+        if medium.albedo.maximum == 0 or not self._has_sources:
             active = mi.UInt32()
         return active, classes
 
@@ -291,7 +291,7 @@ class CachedMedium:
             mi.LogLevel.Info,
             f"irrcache: {self.label}solver {self.solver.name} ({self._reason}); cache of "
             f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {active} "
-            f"of {grid.voxel_count} see the medium",
+            f"of {grid.voxel_count} are active",
         )
 
     def _direct_lights(
@@ -322,8 +322,8 @@ class CachedMedium:
         )
 
     @property
-    def _is_lit(self) -> bool:
-        """Whether the scene has any emitter or emissive medium."""
+    def _has_sources(self) -> bool:
+        """Whether the scene has any emitter, or this medium emits."""
         return bool(self.description.emitters) or self.medium.emission is not None
 
     def _check_memory(self, grid: Grid, moments: int) -> None:

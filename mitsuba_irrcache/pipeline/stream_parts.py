@@ -36,7 +36,7 @@ class _Collector(IrradianceCache):
         self.found: IrradianceCache | None = None
 
     def begin(self, seed: int, batches: int) -> None:
-        """Discard collected batches, and pretend that the stream ``seed`` has ``batches``."""
+        """Discard collected batches, and count ``batches`` of the stream ``seed`` as present."""
         self._sums = self._sums.empty().with_count(seed, batches * self.batch)
         self.found = self.empty_copy()
 

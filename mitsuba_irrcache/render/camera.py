@@ -247,7 +247,7 @@ class TracedCameraRays:
     ) -> None:
         self.media, self.projections = description.media, projections
         self.brightest = description.brightest
-        #: the one that gathers most: a dark medium has no errors to tell
+        #: the projection with most channels: media without a cache have no error estimates
         self.projection = max(projections, key=lambda p: p.channel_count)
         self.hide_emitters = hide_emitters
         #: narrow sources, whose direct radiance is attenuated by the original extinction (see
@@ -260,8 +260,9 @@ class TracedCameraRays:
         self._ends_in_media = max_depth < 0
         self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
-        #: what irradiance on surfaces is computed with. An object that outlives the scene must not
-        #: hold its emitters: Dr.Jit would call them without their shapes.
+        #: emitters that are sampled for the irradiance on surfaces; None if it is not cached. An
+        #: object that outlives the scene must not hold its emitters: Dr.Jit would call them without
+        #: their shapes.
         self._emitters: SampledEmitters | None = None
         all_visible = len(projections) == len(description.media.grids)
         if max_depth < 0 and all_visible and description.has_surfaces:

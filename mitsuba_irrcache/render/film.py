@@ -25,8 +25,10 @@ from mitsuba_irrcache.render.sampled_emitters import EmitterSample
 
 #: Maximum number of camera samples per kernel launch, to limit the memory of samples and sampler.
 LANES = 1 << 22
-#: Refinement of pixels: ratio of a pixel's variance to the mean variance above which it is refined,
-#: maximum number of new samples per original one, maximum number of new samples over that of all.
+#: Refinement of pixels: half of a pixel's samples is replaced if the variance of its other half
+#: plus the mean variance of the halves around it exceeds OUTLIER times the mean (2 if all are
+#: equal); maximum number of new samples per replaced one; maximum number of new samples over that
+#: of all.
 OUTLIER, MOST_FURTHER, FURTHER_SHARE = 2.0, 64, 0.5
 #: Lower bound of the threshold of the variance; positive, so that it can be raised by a factor.
 LEAST_VARIANCE = 1e-30

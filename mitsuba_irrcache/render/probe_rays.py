@@ -37,7 +37,10 @@ class ProbeRays:
         self._medium = sensor.get_medium()
 
     def radiance(self, scene: mi.Scene, camera_rays: CameraRays) -> np.ndarray:
-        """Return the radiance (pixel, channel) of the media, float64."""
+        """Return the radiance (pixel, channel) that media scatter, float64.
+
+        For an isolated medium it includes that of the background.
+        """
         ray = mi.Ray3f(self._ray)
         found = camera_rays.sample(scene, _Middle(), ray, self._medium, mi.Bool(True))
         radiance = found.scattered

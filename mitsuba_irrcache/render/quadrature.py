@@ -21,9 +21,9 @@ GAUSS_LEGENDRE = (
 def curved(previous, a, b, ratio: mi.Float) -> tuple:
     """Scale the values at both ends of a segment to the mean of an interpolating parabola.
 
-    The parabola also passes through the previous value ``before``; ``ratio`` is the length of the
-    segment over that of the previous one. Linear interpolation of curved functions has an error of
-    the same sign on every ray; this correction removes its mean.
+    The parabola also passes through the value ``previous`` at the start of the segment before;
+    ``ratio`` is the length of the segment over that of the previous one. Linear interpolation of
+    curved functions has an error of the same sign on every ray; this correction removes its mean.
     """
     # docs/primer, eq. (5.5)
     # Sagitta of the parabola over the mean, which is scaled to 1.

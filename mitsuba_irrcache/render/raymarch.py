@@ -52,8 +52,9 @@ OPAQUE = 4096.0
 class MarchedPart:
     """A part of a medium through which rays are marched on from where the part before left them.
 
-    ``state`` is what a ray carries, None in the first part. It is replaced by that at the end.
-    Without further components of `Layers`, emission, and lights that are evaluated along rays.
+    ``state`` is the state of the rays at the start of the part, None in the first one; it is
+    replaced by that at the end. Further components of `Layers`, emission and direct lights are not
+    supported.
     """
 
     def __init__(self, state: _MarchState | None) -> None:
@@ -66,16 +67,16 @@ class MarchedPart:
 
 @dataclass(frozen=True)
 class CachedFields:
-    """What a cache holds beside its irradiance, and what it leaves to camera rays.
+    """Fields of a cache other than its irradiance, and emitters that camera rays evaluate.
 
     Attributes:
         uncertainty: its error, if that is to be computed, too.
         directional: the factor of anisotropic scattering.
         edges: surfaces that cut voxels.
-        falloff: inverse-square factor of lamps, by which the cached irradiance is divided.
+        falloff: inverse-square factor of nearby emitters, by which the irradiance is divided.
         direct_lights: emitters whose direct irradiance is excluded from the cached one.
 
-    What is None or empty does not exist.
+    Attributes are None or empty if the cache has none.
     """
 
     uncertainty: UncertaintyField | None = None
@@ -204,7 +205,7 @@ class Projection:
     def irradiance_at(
         self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> mi.Float | mi.Color3f:
-        """Look up the cached irradiance for a path from a surface that arrives along ``direction``.
+        """Look up the cached irradiance at the end of a path from a surface along ``direction``.
 
         Anisotropic media weight it by the phase function, without the forward peak.
         """
@@ -380,10 +381,11 @@ class _FieldSample:
 class _MarchState:
     """What a ray carries from segment to segment.
 
-    ``k`` is the number of the next point of the lattice of steps, and ``stride`` how many it is
-    further than the last one, at distance ``t``, where the fields are ``here``. ``previous`` and
-    ``previous_length`` belong to the segment before. ``peak`` is that of `Projection.fetch`, and
-    ``means`` are the mean extinctions towards the direct lights.
+    Points of the lattice of steps are numbered. ``k`` is the number of the last evaluated one plus
+    1, ``stride`` the number of steps from it to the next one (1, 2 or 4), ``t`` the distance of the
+    last one and ``here`` the fields there. ``previous`` and ``previous_length`` belong to the
+    segment before. ``peak`` is that of `Projection.fetch`, and ``means`` are the mean extinctions
+    towards the direct lights.
     """
 
     k: mi.Float
@@ -611,8 +613,8 @@ class _RayMarch:
         """Choose the length of the next step by the radiance that remains, and end rays to which
         little is added.
         """
-        # Upper bound of the remaining radiance, relative to the accumulated radiance (1 if both
-        # are 0).
+        # Compare an upper bound of the radiance still to be added with the accumulated radiance.
+        # Where there is none (`_dark`), compare the transmittance with 1.
         remaining = dr.max(mi.Spectrum(state.transmittance)) * self._max_radiance
         accumulated = dr.select(self._dark, 1, dr.max(state.radiance + state.emitted))
         state.active &= remaining > EARLY_STOP * accumulated

@@ -22,7 +22,8 @@ class SampledEmitters:
 
     Of an environment with a peak, such as a sun in a sky map, only the excess over the luminance
     ``threshold`` is sampled; the remaining radiance is gathered along all directions. Each
-    point-like or distant emitter is sampled once, an environment `ENVIRONMENT_SAMPLES` times.
+    emitter has one sample, an environment with a peak `ENVIRONMENT_SAMPLES`; of more than
+    `MOST_EMITTERS`, each sample stands for several.
     """
 
     def __init__(self, emitters: EmittersByKind) -> None:

@@ -23,8 +23,8 @@ from mitsuba_irrcache.render.surface_paths import SurfacePaths
 from mitsuba_irrcache.render.surface_vertices import facing, lambertian
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
-#: Rays by which a node finds the distances of its surroundings, and by which it gathers radiance;
-#: by which those gather it that only other nodes see.
+#: Number of rays by which a node measures the distances of its surroundings; by which a node that
+#: camera rays need samples its irradiance; by which other nodes do.
 DISTANCE_RAYS, GATHERED, GATHERED_INDIRECT = 32, 128, 32
 #: Rays by which a node gathers what forward peaks scatter, around each narrow source, and the mean
 #: cosine of the angle between them for a source without extent.
@@ -32,10 +32,10 @@ AROUND_SOURCES, MEAN_COSINE = 64, 0.85
 #: Nodes of a view up to which all rays are used: more nodes are close to each other, so that their
 #: errors average out within a pixel.
 FINE_NODES = 1 << 15
-#: Nodes beyond which no further ones are created where rays from nodes end.
+#: Number of nodes from which on no further ones are created.
 MOST_NODES = 1 << 18
-#: How often nodes are created where rays from the last ones end. Paths continue where there are
-#: none.
+#: Number of rounds in which nodes are created: the first where camera rays end, others where rays
+#: from the nodes of the round before end. Paths continue where there are none.
 GENERATIONS = 4
 #: Gather rays of a launch, at most.
 LANES = 1 << 21
@@ -115,8 +115,9 @@ class SurfaceIrradiance:
         self._groups += [group for group in groups if group[0] < group[1]]
 
     def _place(self, scene: mi.Scene, numbers: mi.UInt32, medium: mi.UInt32) -> tuple:
-        """Find new nodes on surfaces in front of which is the ``medium``; return the places where
-        rays from them meet others, and whether they do.
+        """Place new nodes on surfaces that have the ``medium`` in front of them.
+
+        Returns the points that further rays from the nodes hit, and whether they hit any.
         """
         ray, length = self.nodes.rays(numbers)
         p, normals, valid = _first_surface(scene, ray, length)
@@ -144,7 +145,10 @@ class SurfaceIrradiance:
         ray: tuple[mi.UInt32, mi.UInt32],
         count: int,
     ) -> tuple[mi.Ray3f, mi.PCG32]:
-        """Sample cosine-distributed rays: number k of so many from each node, given by its lane."""
+        """Sample cosine-distributed rays from nodes.
+
+        ``ray`` is (lane of the node, number of the ray out of ``count``).
+        """
         lane, k = ray
         words = mi.sample_tea_32(
             dr.gather(mi.UInt32, self.nodes.streams(numbers)[0], lane), self._seed

@@ -46,13 +46,15 @@ from mitsuba_irrcache.transport.path import (
     visibility,
 )
 
-#: Vertices without a diffuse surface up to which positions for nodes are searched.
+#: Maximum number of specular and glossy vertices of a ray up to the diffuse surface where a node is
+#: placed.
 MOST_BOUNCES = 6
 #: Distance, in voxels of its cache, over which the radiance of a medium varies: nodes within the
 #: medium need not be closer than a part of it.
 MEDIUM_CELLS = 8.0
-#: Factor of the distance of a medium with a truncated forward peak: what this scatters of narrow
-#: sources is concentrated in a few degrees, so that shadows have edges of a fraction of it.
+#: Factor of that distance for a medium with a truncated forward peak: radiance of narrow sources
+#: that the peak scatters varies within a few degrees, so that shadows have edges of a fraction of
+#: it.
 PEAK_DISTANCE = 0.25
 #: Height above the surface, over their distance, at which the visibility between a point and a node
 #: is tested: chords of curved surfaces lie below these.

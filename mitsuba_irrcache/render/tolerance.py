@@ -52,9 +52,9 @@ LEAST_OF_DETAIL = 1 / 3
 MARGIN = 1.1
 #: Finest resolution that is tried, unless the data have more voxels along their longest side.
 FINEST = 256
-#: Least directions or samples of a part of a cache, for single scattering and several orders: the
-#: ordinates that solve for all orders are few in a small part, and the solution is then not only
-#: noisy, but too bright (.7 % of the mean with 64 and an albedo of .98 at depth 12). Most of them.
+#: Minimum number of directions or samples in a part of a cache, for single scattering and for
+#: several orders; maximum number in parts of finer caches. With few ordinates the solution for all
+#: orders is not only noisy, but too bright (.7 % of the mean with 64, albedo .98 and depth 12).
 LEAST_PART_ONCE, LEAST_PART, LARGEST_PART = 64, 128, 256
 #: Ratio of the scatter of fine to that of coarse caches, about; and the number of independent
 #: values, about, in an image's noise due to directions, which all pixels share.
@@ -108,7 +108,7 @@ class Level:
         return self._camera_rays[step]
 
     def reset(self, samples: int) -> None:
-        """Forget what was measured for another scene."""
+        """Discard the measurements of another scene."""
         self.builder.samples, self.scatter, self.noise_free = samples, None, None
 
     def error_of_detail(self) -> float:

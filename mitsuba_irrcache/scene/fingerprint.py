@@ -167,7 +167,7 @@ def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
 
 
 def digests(scene: mi.Scene, media: Media, medium: MediumGrid) -> dict[str, str]:
-    """Return the SHA-256 of each input of the irradiance in ``medium``, by the input's name.
+    """Return a digest (128 bits) of each input of the irradiance in ``medium``, by its name.
 
     ``medium`` is one of the ``media`` of the scene. `RESPONSES` is not a digest, see `responses`.
     """

@@ -26,7 +26,8 @@ SMALL_BORDER_ERROR = 0.2
 MOST_VOXELS, MOST_DIRECTIONAL = 1 << 25, 1 << 21
 #: RMSE of the image, in % of its mean, that ``resolution`` 0 aims at. The error estimates below are
 #: fits to images of a CT head and of random and smooth media of 0.3 to 100 optical depths per data
-#: voxel. The error is inversely proportional to the square of the number of voxels along an axis.
+#: voxel. The error falls with the number of voxels along an axis to the power 1.2 at dense
+#: boundaries (BORDER_ORDER) and 1.5 in opaque data (OPAQUE_SIZE_ORDER).
 TARGET_ERROR = 0.5
 #: RESOLVED is the optical depth of a data voxel up to which voxels of that size have the target
 #: error. Above, the number of voxels is proportional to the optical depth, and above OPAQUE to its
@@ -56,8 +57,8 @@ VERY_OPAQUE, MOST_PER_OPAQUE_VOXEL, MOST_IN_OPAQUE_DATA = 60.0, 10.0, 1 << 25
 #: more expensive. At an optical depth of 40 this number has an error of 0.5 % (ball) and 0.7 %
 #: (cube).
 MOST_IN_GLASS = 64
-#: Maximum number of voxels of a cache that is finer than its data: all orders of scattering then
-#: take half a minute on two cores.
+#: Maximum number of voxels of a cache that is finer than its data, unless these are opaque: all
+#: orders of scattering then take half a minute on two cores.
 MOST_REFINED = 1 << 24
 
 #: Error [%] that voxels larger than those of the data may cause under smooth illumination, and
@@ -125,8 +126,8 @@ class SizeRule:
 def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Grid, str]:
     """Choose the grid of the cache; also return the reason.
 
-    With ``resolution`` 0 the voxels are those of the medium, since larger ones lose detail, or
-    smaller if the medium is dense, within the limits of the ``rule``.
+    With ``resolution`` 0 the voxels are those of the medium's data, smaller ones if it is dense, or
+    larger ones under smooth illumination, within the limits of the ``rule``.
     """
     data, frame = (medium.original or medium).sigma_t.grid, medium.frame
     voxels = MOST_VOXELS if medium.phase.is_isotropic else MOST_DIRECTIONAL
@@ -139,7 +140,7 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
         count = np.ceil(extinction * longest / _edge_of_error(rule.among_surfaces.target_error))
         count = max(count, 0 if data is None else max(data.shape))
         grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
-        reason = f"of the medium, {least} to {most} among surfaces"
+        reason = f"by estimated error and data, {least} to {most} among surfaces"
     else:
         grid, reason = _estimated_grid(medium, rule, voxels)
     return grid.shared(medium.sigma_t.grid, medium.albedo.grid), reason
@@ -195,7 +196,7 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
         limit = min(voxels, max(refined, data.voxel_count))
     for bound, message in (
         ((limit / np.prod(sides)) ** (1 / 3), f"as fine as {limit} voxels allow"),
-        (rule.most / sides.max(), f"of the medium, at most {rule.most}"),
+        (rule.most / sides.max(), f"at most {rule.most} along the longest side"),
     ):
         if bound < 1:
             sides, reason = sides * bound, message
@@ -342,7 +343,10 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
 
 
 def warn_of_opaque_voxels(medium: MediumGrid, grid: Grid, max_depth: int) -> bool:
-    """Log a warning if voxels are too opaque for several orders of scattering; return whether."""
+    """Log a warning if voxels are too opaque for several orders of scattering.
+
+    Returns whether it was logged.
+    """
     data = (medium.original or medium).sigma_t.grid
     if max_depth == 2 or data is None:
         return False

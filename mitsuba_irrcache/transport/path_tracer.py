@@ -1,7 +1,8 @@
 """The path loop: vertices in media and on surfaces, until paths end.
 
-It serves both sides of the method: from voxel centres it estimates the irradiance, from surfaces
-seen by the camera it estimates the reflected radiance.
+It is used by the solver ``path`` (irradiance at voxel centres), by ``sweep`` (radiance that enters
+a medium from surfaces or through glass), and by camera rays (radiance of surfaces without cached
+irradiance).
 
 Depth has the meaning it has in ``volpath``: every collision in a medium and every surface that is
 not null is a vertex of the path; null surfaces are free. An emitter contributes if fewer than

@@ -25,18 +25,19 @@ import mitsuba as mi
 from mitsuba_irrcache.grids.grid import Grid
 
 #: Coefficients of 1 / c = CONSTANT + SLOPE tau, which is within 2 % of the exact value for optical
-#: depths tau up to 6 of a cubic voxel; deeper voxels are hardly compensated (OPAQUE).
+#: depths tau up to 6 of a cubic voxel. `coefficient` limits c above a depth of about 2
+#: (LARGEST_PART), and halves it at a depth of OPAQUE.
 CONSTANT, SLOPE = 10.25, 3.4
 #: Part of the mean square displacement per collision that may be compensated. Along few ordinates
 #: and tracks, the displacement of single voxels is less than the mean, and more would make the
-#: solution unstable in dense voxels (an optical depth above 2). In opaque voxels, of several times
-#: the depth OPAQUE, nothing is compensated: multigrid would converge slowly, and images show the
-#: boundary of such media only.
+#: solution unstable in dense voxels (an optical depth above 2). In opaque voxels c is
+#: divided by 1 + (tau / OPAQUE)^4: multigrid would converge slowly, and images show the boundary of
+#: such media only.
 LARGEST_PART, OPAQUE = 0.4, 6.0
 #: Mean over all directions of the length of a track from its entry into a cubic voxel to the middle
 #: of the slice, in units of the edge.
 HALF_WAY = 0.6
-#: Optical depth of a voxel below which numerical diffusion, a 4000th at most, is neglected.
+#: Optical depth of a voxel below which numerical diffusion, less than 3e-4, is neglected.
 NEGLIGIBLE_DEPTH = 0.03
 
 

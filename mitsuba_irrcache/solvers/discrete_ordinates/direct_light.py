@@ -29,8 +29,8 @@ from mitsuba_irrcache.transport.tracking import medium_transmittance
 LARGE_SOLID_ANGLE = 2.0
 #: Number of pairs of a point in the voxels' box and one on the emitter for this estimate.
 POINTS = 1024
-#: Number of points on all area emitters in an estimate for each voxel, and the maximum number
-#: if there are more emitters, each of which gets one point.
+#: Number of points on all area emitters together in an estimate for each voxel: SAMPLES, or one for
+#: each emitter if there are more, but at most MOST_SAMPLES.
 SAMPLES, MOST_SAMPLES = 16, 32
 
 

@@ -48,10 +48,10 @@ class SweptVolume:
     Without ``source`` (no voxel emits or scatters), ``values`` has one value per voxel and channel,
     to which the irradiance is added. With a source, it has the four values of `Tracks.sweep`;
     ``source`` is the same array, or another one if ``values`` holds copies, in which case the copy
-    of a lane starts at voxel ``begin``. Channels of a voxel are adjacent.
+    of a lane starts at index ``begin`` (voxels times channels). Channels of a voxel are adjacent.
 
     With ``begin_backward`` the two ways of a pair are stored separately: the ordinate against the
-    axis writes its values from that voxel on, and values are replaced instead of added to;
+    axis writes its values from that index on, and values are replaced instead of added to;
     ``source`` has one value per voxel and way in the same layout; W is not multiplied by solid
     angles, and the irradiance excludes the source of the voxel itself. With ``collisions`` there
     are two values instead of four: the radiance of collisions without the source of the voxel, and
@@ -701,7 +701,7 @@ class _PairSweep:
     def _attenuated_parts(
         self, way: _Way, radiance: list, extinction: mi.Float, slot: mi.UInt32
     ) -> tuple[list, list, mi.Float]:
-        """See `_attenuate_at_surface`."""
+        """Return the results of `_attenuate_at_surface` where a surface crosses the voxel."""
         first, last, before, behind, left, _ = self._crossing(way, slot, slot > 0)
         crosses = first <= last
         reaches, leaves = ~crosses | (first > 0), crosses & (last <= 0)
@@ -723,7 +723,7 @@ class _PairSweep:
         slot: mi.UInt32,
         source: mi.Float,
     ) -> tuple[list, list]:
-        """See `_collide_at_surface`."""
+        """Return the results of `_collide_at_surface` where a surface crosses the voxel."""
         # docs/primer, eq. (4.16)
         first, last, before, behind, left, voxels = self._crossing(way, slot, slot > 0)
         crosses = first <= last

@@ -330,8 +330,8 @@ class MultigridLevel:
             if not self.coarsest and nonzero:
                 mi.Log(
                     mi.LogLevel.Warn,
-                    "irrcache: multiple scattering has not converged, its relative error is "
-                    f"{error:.1e}",
+                    f"irrcache: multiple scattering has not converged after {MAX_CYCLES} "
+                    f"multigrid cycles, its relative error is {error:.1e}",
                 )
         return phi
 

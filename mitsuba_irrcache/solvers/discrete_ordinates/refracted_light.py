@@ -48,8 +48,8 @@ def is_needed(scene: mi.Scene) -> bool:
 def refracted_irradiance(
     boundary: SurfaceBoundary, grid: Grid, voxels: mi.UInt32, seed: tuple[int, int]
 ) -> mi.Spectrum:
-    """Estimate the mean over ``voxels`` of the uncollided irradiance that is refracted or reflected
-    on its way from emitters.
+    """Estimate the mean over each of the ``voxels`` of the uncollided irradiance that is refracted
+    or reflected on its way from emitters.
     """
     count = dr.width(voxels)
     samples = int(np.clip(PATHS // count, FEWEST, MOST))

@@ -14,7 +14,7 @@ its own mean. If they were first resampled to the grid and then interpolated aga
 become wider and shadows darker: on a CT head at twice its resolution, by 1 % of the irradiance in
 the air and 5 % in the skin.
 
-Each launch sweeps an ordinate and its opposite along the same tracks: these are two independent
+An ordinate and its opposite are swept together along the same tracks: these are two independent
 chains of arithmetic, and odd parts of the integrand over directions cancel.
 
 Long characteristics: Askew, *A characteristics formulation of the neutron transport equation in
