@@ -12,10 +12,9 @@ from mitsuba_irrcache.scene.compile import media_of
 from mitsuba_irrcache.solvers import half_space
 from mitsuba_irrcache.solvers.base import Solver, registered, solver_named
 from mitsuba_irrcache.solvers.grid_size import (
-    BORDER_ERROR,
-    BORDER_ORDER,
     REQUESTED,
     TARGET_ERROR,
+    border_error,
     choose_grid,
 )
 from mitsuba_irrcache.solvers.sweep import SweepSolver
@@ -120,7 +119,7 @@ def needs_no_cache(
     error *= max_depth != 2  # single scattering is exact
     grid, _ = choose_grid(medium, 0, SweepSolver.size_rule)
     depth = medium.sigma_t.maximum * grid.voxel_size.max()
-    cached = BORDER_ERROR * depth**BORDER_ORDER
+    cached = border_error(medium, grid)
     if cached <= max(error, 1.2 * TARGET_ERROR):
         return None
     return (

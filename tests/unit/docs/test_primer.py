@@ -141,6 +141,11 @@ CONSTANTS = [
         r"; up to (\d+) where \$d_v > (\d+)\$",
         (grid_size.MOST_PER_OPAQUE_VOXEL, grid_size.VERY_OPAQUE),
     ),
+    (
+        "7-defaults",
+        r"at most \$([\d.]+) \\, d\^\{([\d.]+)\}\$ %",
+        (grid_size.SMOOTH_BORDER_ERROR, grid_size.SMOOTH_BORDER_ORDER),
+    ),
     ("7-defaults", r"\\epsilon_B\$ exceeds (\d+) %", (grid_size.LARGE_BORDER_ERROR,)),
     (
         "7-defaults",

@@ -146,6 +146,21 @@ def test_voxels_are_larger_in_smooth_light():
         assert in_light(values, Detail.SHARP) == chosen(values)
 
 
+def test_a_cut_boundary_needs_fewer_voxels_in_smooth_light():
+    """Where nothing casts sharp shadows, the error at the boundary decreases faster with voxels."""
+    cut = np.full((4, 4, 4), 15.0)
+    assert in_light(cut, Detail.SHARP) == (75, 75, 75)
+    assert in_light(cut, Detail.SMOOTH) == (32, 32, 32)
+    matter = medium(np.full((4, 4, 4), 60.0)).replaced(context=MediumContext(detail=Detail.SMOOTH))
+    grid, _ = choose_grid(matter, 0, solver_named("sweep").size_rule)
+    assert grid.shape == (127, 127, 127)
+    assert grid_size.border_error(matter, grid) == pytest.approx(0.5, rel=0.02)  # rounded down
+    # Estimates are never larger than without smooth light.
+    coarse = Grid((8, 8, 8), np.eye(4))
+    sharp = medium(np.full((4, 4, 4), 60.0))
+    assert grid_size.border_error(matter, coarse) == grid_size.border_error(sharp, coarse)
+
+
 def test_albedos_with_detail_need_voxels_in_smooth_light():
     values = np.random.default_rng(2).uniform(0, 1, 72**3).astype(np.float32)
     grid = Grid((72, 72, 72), np.eye(4))
