@@ -149,12 +149,19 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
     return grid.shared(medium.sigma_t.grid, medium.albedo.grid), reason
 
 
+def _border_laws(detail: Detail) -> list[tuple[float, float]]:
+    """Return factors and exponents of the estimates of the error [%] at the boundary, as powers of
+    the optical depth of a voxel; the smallest one applies.
+    """
+    laws = [(BORDER_ERROR, BORDER_ORDER)]
+    if detail is not Detail.SHARP:
+        laws.append((SMOOTH_BORDER_ERROR, SMOOTH_BORDER_ORDER))
+    return laws
+
+
 def _edge_of_error(error: float, detail: Detail = Detail.SHARP) -> float:
     """Return the optical depth of a voxel's edge at which the estimated error [%] is ``error``."""
-    edge = (error / BORDER_ERROR) ** (1 / BORDER_ORDER)
-    if detail is Detail.SHARP:
-        return edge
-    return max(edge, (error / SMOOTH_BORDER_ERROR) ** (1 / SMOOTH_BORDER_ORDER))
+    return max((error / factor) ** (1 / order) for factor, order in _border_laws(detail))
 
 
 def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Grid, str]:
@@ -198,8 +205,8 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
     reason = max(wanted, key=lambda key: wanted[key].max())
     limit = voxels
     if data is not None and np.prod(sides) > data.voxel_count:
-        refined = MOST_IN_OPAQUE_DATA if opaque else MOST_REFINED
-        limit = min(voxels, max(refined, data.voxel_count))
+        finest = MOST_IN_OPAQUE_DATA if opaque else MOST_REFINED
+        limit = min(voxels, max(finest, data.voxel_count))
     for bound, message in (
         ((limit / np.prod(sides)) ** (1 / 3), f"as fine as {limit} voxels allow"),
         (rule.most / sides.max(), f"at most {rule.most} along the longest side"),
@@ -330,10 +337,7 @@ def border_error(medium: MediumGrid, grid: Grid) -> float:
     """
     # docs/primer, eq. (7.1)
     depth = _border_extinction(medium) * grid.voxel_size.max()
-    error = BORDER_ERROR * depth**BORDER_ORDER
-    if medium.detail is Detail.SHARP:
-        return error
-    return min(error, SMOOTH_BORDER_ERROR * depth**SMOOTH_BORDER_ORDER)
+    return min(factor * depth**order for factor, order in _border_laws(medium.detail))
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
