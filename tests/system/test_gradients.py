@@ -355,7 +355,7 @@ def test_the_grid_is_kept_while_parameters_carry_gradients(rgb):
     """With ``resolution`` 0 a denser medium gets a finer cache, but not within an optimisation."""
     scene, params, key = small(resolution=0)
     data, shapes = dr.full(mi.TensorXf, 0.5, params[key].shape), []
-    for scale, attached in ((1.0, False), (10.0, True), (10.0, False)):
+    for scale, attached in ((1.0, False), (40.0, True), (40.0, False)):
         params[key] = data * scale
         if attached:
             dr.enable_grad(params[key])
