@@ -118,8 +118,9 @@ def nodes_of_emitters(scene: mi.Scene) -> dict[mi.Object, mi.Emitter]:
 
 
 def key_of_node(params: mi.SceneParameters, keys: list[str], node: mi.Object) -> str:
-    """Return the first of ``keys`` that is a parameter of ``node``, or the first of all."""
-    return next((key for key in keys if params.properties[key][2] == node), keys[0])
+    """Return a parameter of ``node``, one of ``keys`` if possible; the first key if it has none."""
+    every = (*keys, *params.keys())
+    return next((key for key in every if params.properties[key][2] == node), keys[0])
 
 
 def refuse(key: str, reason: str) -> None:

@@ -159,6 +159,12 @@ def _border_laws(detail: Detail) -> list[tuple[float, float]]:
     return laws
 
 
+def _error_of_edge(depth: float, detail: Detail) -> float:
+    """Return the estimated error [%] for an optical ``depth`` of a voxel's edge."""
+    # docs/primer, eq. (7.1)
+    return min(factor * depth**order for factor, order in _border_laws(detail))
+
+
 def _edge_of_error(error: float, detail: Detail = Detail.SHARP) -> float:
     """Return the optical depth of a voxel's edge at which the estimated error [%] is ``error``."""
     return max((error / factor) ** (1 / order) for factor, order in _border_laws(detail))
@@ -335,9 +341,7 @@ def border_error(medium: MediumGrid, grid: Grid) -> float:
     """Estimate the error [%] of pixels at the boundary of a medium that is dense there, due to
     interpolation between the voxels of ``grid``.
     """
-    # docs/primer, eq. (7.1)
-    depth = _border_extinction(medium) * grid.voxel_size.max()
-    return min(factor * depth**order for factor, order in _border_laws(medium.detail))
+    return _error_of_edge(_border_depth(medium, grid), medium.detail)
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
@@ -345,8 +349,8 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
 
     Irradiance decays within a fraction of a mean free path there, and no voxel lies beyond.
     """
-    depth = _border_extinction(medium) * grid.voxel_size.max()
-    error = border_error(medium, grid)
+    depth = _border_depth(medium, grid)
+    error = _error_of_edge(depth, medium.detail)
     if error > LARGE_BORDER_ERROR:
         mi.Log(
             mi.LogLevel.Warn,
@@ -390,6 +394,11 @@ def warn_of_unresolved_detail(medium: MediumGrid, grid: Grid) -> None:
             f"an error of about {error:.1f} % of the mean is expected. Raise resolution "
             f"(now {max(grid.shape)}), or set tolerance to have it chosen.",
         )
+
+
+def _border_depth(medium: MediumGrid, grid: Grid) -> float:
+    """Return the optical depth of the longest edge of a voxel at the boundary of a medium."""
+    return _border_extinction(medium) * grid.voxel_size.max()
 
 
 def _border_extinction(medium: MediumGrid) -> float:
