@@ -103,7 +103,7 @@ def nodes_of_medium(
         for node in (volume, *children(volume).values()):
             if nodes.get(node, role) != role:
                 reason = f"both {nodes[node]} and {role} depend on it"
-                refuse(key_of_node(params, keys, node), reason)
+                refuse(key_of_node(params, keys, node, SIGMA_T), reason)
             nodes[node] = role
     return nodes
 
@@ -117,10 +117,11 @@ def nodes_of_emitters(scene: mi.Scene) -> dict[mi.Object, mi.Emitter]:
     return nodes
 
 
-def key_of_node(params: mi.SceneParameters, keys: list[str], node: mi.Object) -> str:
-    """Return a parameter of ``node``, one of ``keys`` if possible; the first key if it has none."""
-    every = (*keys, *params.keys())
-    return next((key for key in every if params.properties[key][2] == node), keys[0])
+def key_of_node(
+    params: mi.SceneParameters, keys: list[str], node: mi.Object, otherwise: str
+) -> str:
+    """Return the first of ``keys`` that is a parameter of ``node``, or ``otherwise``."""
+    return next((key for key in keys if params.properties[key][2] == node), otherwise)
 
 
 def refuse(key: str, reason: str) -> None:

@@ -193,7 +193,7 @@ def roles_among(
         own = nodes_of_medium(params, keys, medium)
         for node, role in own.items():
             if isinstance(nodes.get(node), tuple):
-                refuse(key_of_node(params, keys, node), "several media depend on it")
+                refuse(key_of_node(params, keys, node, keys[0]), "several media depend on it")
             nodes[node] = number, role
     for shape in scene.shapes():
         if shape.bsdf() is not None:
