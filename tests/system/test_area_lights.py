@@ -115,6 +115,49 @@ def test_single_scattering(scenes, name):
     assert np.abs(blocks).max() < 0.015
 
 
+def close_lamp_image(scene: mi.Scene, lamp_shape: mi.Shape, paths: int = 1 << 23) -> np.ndarray:
+    """Integrate over positions along camera rays and points on a lamp outside the cube."""
+    rng = mi.PCG32(paths)
+    at = mi.Point2f(rng.next_float32(), rng.next_float32())
+    ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
+    cube = mi.BoundingBox3f([-1] * 3, [1] * 3)
+    hit, near, far = cube.ray_intersect(ray)
+    t = near + (far - near) * rng.next_float32()
+    p = ray(t)
+    on = lamp_shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
+    distance = dr.norm(on.p - p)
+    w = (on.p - p) / distance
+    geometry = dr.maximum(-dr.dot(w, on.n), 0) / (distance * distance * on.pdf)
+    inside = dr.minimum(cube.ray_intersect(mi.Ray3f(p, w))[2], distance)
+    value = RADIANCE * geometry * dr.exp(-SIGMA_T * (t - near + inside)) * (far - near)
+    pixel = mi.UInt32(at.y * SIZE) * SIZE + mi.UInt32(at.x * SIZE)
+    total = dr.zeros(mi.Float, SIZE * SIZE)
+    dr.scatter_add(total, dr.select(hit, value, 0), pixel)
+    scale = SIGMA_T * ALBEDO / (4 * np.pi) * SIZE * SIZE / paths
+    return scale * np.array(total).reshape(SIZE, SIZE)
+
+
+@pytest.mark.usefixtures("mono")
+@pytest.mark.parametrize("solver", ["path", "sweep"])
+def test_small_emitter_close_to_a_face(scenes, solver):
+    """A small emitter close to a face of the medium, without an integrator of Mitsuba.
+
+    Shadow rays of `volpath` are occluded there by the emitter itself: docs/validation.md.
+    """
+    centre = [0.1, 1.19, -0.35]
+    place = mi.ScalarTransform4f().look_at(centre, [0, 0, 0], [0, 0.3, 1]).scale(0.095)
+    emitter = {"type": "area", "radiance": RADIANCE}
+    lamp_shape = {"type": "rectangle", "to_world": place, "emitter": emitter}
+    integrator = {"type": "irrcache", "solver": solver, "max_depth": 2, "cache_spp": 16}
+    cube = scenes.boundary(scenes.medium(SIGMA_T, ALBEDO))
+    scene = scenes.load(integrator, cube, SIZE, emitter=lamp_shape)
+    lamp_shape = next(shape for shape in scene.shapes() if shape.is_emitter())
+    expected = close_lamp_image(scene, lamp_shape)
+    error = scenes.image(scene, spp=SPP)[..., 0] - expected
+    assert abs(error.mean()) < 0.003 * expected.mean()
+    assert np.abs(error).max() < 0.04 * expected.max()  # noise of what is expected: 2 %
+
+
 @pytest.mark.usefixtures("mono")
 @pytest.mark.parametrize(("sigma_t", "bound"), [(1.0, 0.015), (4.0, 0.01)])
 def test_single_scattering_by_sweep(scenes, sigma_t, bound):
