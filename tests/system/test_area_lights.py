@@ -120,19 +120,19 @@ def close_lamp_image(scene: mi.Scene, lamp_shape: mi.Shape, paths: int = 1 << 23
     rng = mi.PCG32(paths)
     at = mi.Point2f(rng.next_float32(), rng.next_float32())
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
-    cube = mi.BoundingBox3f([-1] * 3, [1] * 3)
-    hit, near, far = cube.ray_intersect(ray)
+    outwards = dr.mulsign(mi.Vector3f(1), ray.d)
+    near, far = dr.max((-outwards - ray.o) / ray.d), dr.min((outwards - ray.o) / ray.d)
     t = near + (far - near) * rng.next_float32()
     p = ray(t)
     on = lamp_shape.sample_position(0, mi.Point2f(rng.next_float32(), rng.next_float32()))
     distance = dr.norm(on.p - p)
     w = (on.p - p) / distance
     geometry = dr.maximum(-dr.dot(w, on.n), 0) / (distance * distance * on.pdf)
-    inside = dr.minimum(cube.ray_intersect(mi.Ray3f(p, w))[2], distance)
+    inside = dr.minimum(dr.min((dr.mulsign(mi.Vector3f(1), w) - p) / w), distance)
     value = RADIANCE * geometry * dr.exp(-SIGMA_T * (t - near + inside)) * (far - near)
     pixel = mi.UInt32(at.y * SIZE) * SIZE + mi.UInt32(at.x * SIZE)
     total = dr.zeros(mi.Float, SIZE * SIZE)
-    dr.scatter_add(total, dr.select(hit, value, 0), pixel)
+    dr.scatter_add(total, dr.select(near < far, value, 0), pixel)
     scale = SIGMA_T * ALBEDO / (4 * np.pi) * SIZE * SIZE / paths
     return scale * np.array(total).reshape(SIZE, SIZE)
 
