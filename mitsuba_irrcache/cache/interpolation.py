@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.cache.border import BorderProfile
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.cache.peak_depths import PeakDepths
 from mitsuba_irrcache.core.immutable import Immutable
@@ -26,6 +27,7 @@ class Interpolation(Immutable):
             and narrow sources; None if no peak is truncated, or there are no such sources.
         voxel_classes: position of the voxels relative to surfaces and media; None if there is no
             surface and no other medium among them.
+        border: profile of Phi at the faces of the grid; None if the medium is not dense there.
     """
 
     def __init__(
@@ -35,10 +37,11 @@ class Interpolation(Immutable):
         direct_lights: Sequence[DirectLight] = (),
         voxel_classes: VoxelClasses | None = None,
         peak_depths: PeakDepths | None = None,
+        border: BorderProfile | None = None,
     ) -> None:
         self.directional, self.falloff = directional, falloff
         self.direct_lights, self.voxel_classes = tuple(direct_lights), voxel_classes
-        self.peak_depths = peak_depths
+        self.peak_depths, self.border = peak_depths, border
 
 
 #: Trilinear interpolation of isotropically scattered radiance, and nothing else.

@@ -28,6 +28,7 @@ def irradiance_field(
 ) -> RootField:
     """Create the field of `IrradianceCache.field`."""
     falloff, classes = interpolation.falloff, interpolation.voxel_classes
+    border = interpolation.border
     lights = interpolation.direct_lights
     brightest = [dr.max(m)[0] for m in sums.irradiance()] if lights else []
     brightest += [light.maximum for light in lights]
@@ -50,10 +51,12 @@ def irradiance_field(
     if sums.has_own_errors:
         variance = on_grid(grid, active, noise[:channels]).array
     separated = None if classes is None else classes.separated
+    if border is not None:
+        values = border.at_centres(values, known, channels)
     values = conserving(grid, values, known, channels, share, separated)
     if classes is not None:
         values = classes.filled(values, channels)
-    field = RootField(grid, values, channels, variance)
+    field = RootField(grid, values, channels, variance, border)
     if falloff is not None:
         field.maximum *= falloff.maximum(active)
     field.maximum = max(field.maximum, *brightest, 0.0)

@@ -81,8 +81,11 @@ class FluenceFields:
             smooth = dr.rsqrt(falloff.of_voxels(voxels))
             roots = [r * smooth for r in roots]
         values = interleaved(roots, grid.voxel_count)
-        values = conserving(grid, values, dr.full(mi.Bool, True, grid.voxel_count), channels)
-        self.irradiance, self.falloff = RootField(grid, values, channels), falloff
+        known, border = dr.full(mi.Bool, True, grid.voxel_count), cache.interpolation.border
+        if border is not None:
+            values = border.at_centres(values, known, channels)
+        values = conserving(grid, values, known, channels)
+        self.irradiance, self.falloff = RootField(grid, values, channels, border=border), falloff
         if falloff is not None:
             self.irradiance.maximum *= falloff.maximum(voxels)
         maxima = [self.irradiance.maximum, brightest, *(light.maximum for light in lights)]

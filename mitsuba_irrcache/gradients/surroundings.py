@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.cache.border import BorderProfile
 from mitsuba_irrcache.cache.conservative import conserving
 from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.core.sequences import (
@@ -50,13 +51,15 @@ class KnownFluence:
 
     falloff, angular = None, None
 
-    def __init__(self, grid: Grid, values: list[mi.Float]) -> None:
+    def __init__(self, grid: Grid, values: list[mi.Float], border: BorderProfile | None) -> None:
         roots = [dr.sqrt(dr.maximum(v, 0)) for v in values]
-        flat = conserving(
-            grid, interleaved(roots, grid.voxel_count), dr.full(mi.Bool, True, grid.voxel_count),
-            len(values),
-        )  # fmt: skip
-        self.irradiance, self.direct_lights = RootField(grid, flat, len(values)), []
+        flat, channels = interleaved(roots, grid.voxel_count), len(values)
+        known = dr.full(mi.Bool, True, grid.voxel_count)
+        if border is not None:
+            flat = border.at_centres(flat, known, channels)
+        flat = conserving(grid, flat, known, channels)
+        self.irradiance = RootField(grid, flat, channels, border=border)
+        self.direct_lights = []
 
 
 class CoupledMedium:
@@ -99,7 +102,7 @@ class CoupledMedium:
         self._update()
 
     def _update(self) -> None:
-        fluence = KnownFluence(self.grid, self.values)
+        fluence = KnownFluence(self.grid, self.values, self.cache.interpolation.border)
         self.march = CameraReplay(self.medium, fluence, None, self.step)
 
     def scattered(self, source: list[mi.Float]) -> list[mi.Float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -11,6 +13,21 @@ from mitsuba_irrcache.grids.grid import Grid
 
 #: Maximum ratio of neighbouring square roots of irradiance used for extrapolation.
 STEEPEST = 4.0
+
+
+class Border(Protocol):
+    """The profile of a field at the faces of its grid, see `BorderProfile`."""
+
+    def growth(
+        self,
+        axis: int,
+        voxel: mi.UInt32,
+        channel: mi.UInt32,
+        roots: tuple[mi.Float, mi.Float],
+        ratio: mi.Float,
+        active: mi.Bool,
+    ) -> mi.Float:
+        """Return the ratio of the root one voxel beyond a face to that at the outermost centre."""
 
 
 class RootField(GridField):
@@ -26,11 +43,16 @@ class RootField(GridField):
     """
 
     def __init__(
-        self, grid: Grid, roots: mi.Float, channels: int, variance: mi.Float | None = None
+        self,
+        grid: Grid,
+        roots: mi.Float,
+        channels: int,
+        variance: mi.Float | None = None,
+        border: Border | None = None,
     ) -> None:
-        """Extrapolate ``roots``; ``variance`` is the relative variance of noisy values."""
+        """Extrapolate ``roots``, see `extrapolated`."""
         self.inner, extension = grid, Extension(grid)
-        roots = extrapolated(extension, roots, channels, variance)
+        roots = extrapolated(extension, roots, channels, variance, border)
         super().__init__(extension.grid, roots, channels)
         self.maximum = self.maximum**2
 
@@ -123,7 +145,11 @@ class Extension:
 
 
 def extrapolated(
-    extension: Extension, roots: mi.Float, channels: int = 1, variance: mi.Float | None = None
+    extension: Extension,
+    roots: mi.Float,
+    channels: int = 1,
+    variance: mi.Float | None = None,
+    border: Border | None = None,
 ) -> mi.Float:
     """Extrapolate square roots to the extended grid, axis by axis.
 
@@ -131,6 +157,7 @@ def extrapolated(
     `STEEPEST`, `STEEPEST`]. Ratios of noisy values are too large on average: with relative
     variances v and v' of the two voxels, the factor 1 - 0.36 (v + v') makes the mean over the outer
     half voxel correct (second moments of the weights 0 to 1/2, and 4/9 for the other two axes).
+    Where the medium is dense, the ratio follows from the profile of the ``border``.
     """
     index = dr.arange(mi.UInt32, extension.grid.voxel_count * channels)
     voxel = index // channels
@@ -138,7 +165,7 @@ def extrapolated(
     inside = extension.inside(voxel)
     outermost = dr.gather(mi.Float, roots, inside * channels + channel)
     result = outermost
-    for further in extension.inwards(voxel):
+    for axis, further in enumerate(extension.inwards(voxel)):
         beyond, place = further != inside, further * channels + channel
         other = dr.gather(mi.Float, roots, place)
         known = beyond & (outermost > 0) & (other > 0)
@@ -146,6 +173,8 @@ def extrapolated(
         if variance is not None:
             noise = dr.gather(mi.Float, variance, inside * channels + channel)
             ratio = ratio * (1 - 0.36 * (noise + dr.gather(mi.Float, variance, place)))
+        if border is not None:
+            ratio = border.growth(axis, inside, channel, (outermost, other), ratio, known)
         result = dr.select(known, result * ratio, result)
     dr.eval(result)
     return result

@@ -20,6 +20,7 @@ from mitsuba_irrcache.cache.angular import (
     warn_of_sharp_shadows,
 )
 from mitsuba_irrcache.cache.area_light import area_lights_of
+from mitsuba_irrcache.cache.border import THIN, BorderProfile
 from mitsuba_irrcache.cache.direct_light import DirectLight, direct_lights_of
 from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.peak_depths import PeakDepths
@@ -39,6 +40,7 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask
 from mitsuba_irrcache.solvers.grid_size import (
     SMALL_BORDER_ERROR,
+    border_depth,
     border_error,
     choose_grid,
     warn_of_dense_border,
@@ -232,7 +234,10 @@ class CachedMedium:
         peak_depths = None
         if medium.original is not None and basis.sources and dr.width(active):
             peak_depths = PeakDepths(medium, grid, active, basis.sources)
-        interpolation = Interpolation(basis, falloff, direct_lights, classes, peak_depths)
+        border = None
+        if border_depth(medium, grid) > THIN:
+            border = BorderProfile(medium, grid, settings.max_depth == 2, solver.is_correlated)
+        interpolation = Interpolation(basis, falloff, direct_lights, classes, peak_depths, border)
 
         def empty(fingerprint: dict[str, str]) -> IrradianceCache:
             return IrradianceCache(

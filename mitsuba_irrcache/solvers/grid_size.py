@@ -38,9 +38,10 @@ RESOLVED, OPAQUE, OPAQUE_POWER, EVEN, MOST_PER_DATA_VOXEL = 0.7, 1.2, 0.45, 4.0,
 #: The error [%] of a medium that is dense at its boundary is about BORDER_ERROR d^BORDER_ORDER,
 #: where d is the optical depth of a cache voxel at the boundary.
 BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
-#: The same under smooth illumination, if it is less: an upper bound for cubes and spheres of depth
-#: 30 and albedos of 0.5 to 0.99, for 0.3 <= d <= 1.2.
-SMOOTH_BORDER_ERROR, SMOOTH_BORDER_ORDER = 2.1, 1.9
+#: The same under smooth illumination and for an albedo of at least HIGH_ALBEDO at the boundary, if
+#: it is less: an upper bound for cubes, for 0.25 <= d <= 1. With an albedo of 0.8 it is the RMSE of
+#: the pixels that show the cube, with 0.5 it would be half of it.
+SMOOTH_BORDER_ERROR, SMOOTH_BORDER_ORDER, HIGH_ALBEDO = 2.1, 1.3, 0.9
 #: RMSE [% of the mean] of an image with all orders of scattering through data with opaque detail as
 #: fine as their voxels: OPAQUE_ERROR d^OPAQUE_DEPTH_ORDER r^OPAQUE_SIZE_ORDER at most, with the
 #: optical depth d of a data voxel and the ratio r of the edges of cache and data voxels. Found with
@@ -140,7 +141,9 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
         least, most = rule.among_surfaces.fewest, rule.among_surfaces.most
         extinction = max(_colliding_extinction(medium), _border_extinction(medium))
         longest = np.linalg.norm(frame[:3, :3], axis=0).max()
-        count = np.ceil(extinction * longest / _edge_of_error(rule.among_surfaces.target_error))
+        count = np.ceil(
+            extinction * longest / _edge_of_error(rule.among_surfaces.target_error, medium)
+        )
         count = max(count, 0 if data is None else max(data.shape))
         grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
         reason = f"by estimated error and data, {least} to {most} among surfaces"
@@ -149,25 +152,25 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
     return grid.shared(medium.sigma_t.grid, medium.albedo.grid), reason
 
 
-def _border_laws(detail: Detail) -> list[tuple[float, float]]:
+def _border_laws(medium: MediumGrid) -> list[tuple[float, float]]:
     """Return factors and exponents of the estimates of the error [%] at the boundary, as powers of
     the optical depth of a voxel; the smallest one applies.
     """
     laws = [(BORDER_ERROR, BORDER_ORDER)]
-    if detail is not Detail.SHARP:
+    if medium.detail is not Detail.SHARP and _border_albedo(medium) >= HIGH_ALBEDO:
         laws.append((SMOOTH_BORDER_ERROR, SMOOTH_BORDER_ORDER))
     return laws
 
 
-def _error_of_edge(depth: float, detail: Detail) -> float:
+def _error_of_edge(depth: float, medium: MediumGrid) -> float:
     """Return the estimated error [%] for an optical ``depth`` of a voxel's edge."""
     # docs/primer, eq. (7.1)
-    return min(factor * depth**order for factor, order in _border_laws(detail))
+    return min(factor * depth**order for factor, order in _border_laws(medium))
 
 
-def _edge_of_error(error: float, detail: Detail = Detail.SHARP) -> float:
+def _edge_of_error(error: float, medium: MediumGrid) -> float:
     """Return the optical depth of a voxel's edge at which the estimated error [%] is ``error``."""
-    return max((error / factor) ** (1 / order) for factor, order in _border_laws(detail))
+    return max((error / factor) ** (1 / order) for factor, order in _border_laws(medium))
 
 
 def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Grid, str]:
@@ -195,7 +198,7 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
         ratio = np.where(ratio >= EVEN, 2 * np.floor(ratio / 2), ratio)
         dense = "finer than those of the medium, which is dense"
         wanted[dense if ratio.max() > 1 else "of the medium"] = data.resolution * ratio
-    edge = _edge_of_error(rule.target_error, medium.detail)
+    edge = _edge_of_error(rule.target_error, medium)
     most_by_border = rule.most_by_border
     if medium.refracts:
         most_by_border = min(most_by_border, MOST_IN_GLASS)
@@ -341,7 +344,7 @@ def border_error(medium: MediumGrid, grid: Grid) -> float:
     """Estimate the error [%] of pixels at the boundary of a medium that is dense there, due to
     interpolation between the voxels of ``grid``.
     """
-    return _error_of_edge(_border_depth(medium, grid), medium.detail)
+    return _error_of_edge(border_depth(medium, grid), medium)
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
@@ -349,8 +352,8 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
 
     Irradiance decays within a fraction of a mean free path there, and no voxel lies beyond.
     """
-    depth = _border_depth(medium, grid)
-    error = _error_of_edge(depth, medium.detail)
+    depth = border_depth(medium, grid)
+    error = _error_of_edge(depth, medium)
     if error > LARGE_BORDER_ERROR:
         mi.Log(
             mi.LogLevel.Warn,
@@ -396,7 +399,7 @@ def warn_of_unresolved_detail(medium: MediumGrid, grid: Grid) -> None:
         )
 
 
-def _border_depth(medium: MediumGrid, grid: Grid) -> float:
+def border_depth(medium: MediumGrid, grid: Grid) -> float:
     """Return the optical depth of the longest edge of a voxel at the boundary of a medium."""
     return _border_extinction(medium) * grid.voxel_size.max()
 
@@ -405,11 +408,22 @@ def _border_extinction(medium: MediumGrid) -> float:
     """Return the 95th percentile of sigma_t on the boundary of the medium, of the densest channel
     [1/scene unit].
     """
+    found = medium.sigma_t.at_world(_on_boundary(medium))
+    return float(np.quantile(np.array(dr.max(mi.Spectrum(found), axis=0)), 0.95))
+
+
+def _border_albedo(medium: MediumGrid) -> float:
+    """Return the 5th percentile of the albedo on the boundary, of its smallest channel."""
+    found = medium.albedo.at_world(_on_boundary(medium))
+    return float(np.quantile(np.array(dr.min(mi.Spectrum(found), axis=0)), 0.05))
+
+
+def _on_boundary(medium: MediumGrid) -> mi.Point3f:
+    """Return random positions on the boundary of the medium."""
     rng = mi.PCG32(4096)
     face = dr.arange(mi.UInt32, 4096) % 6
     place = [rng.next_float32() for _ in range(3)]
     side = mi.Float(face % 2)
     u = mi.Point3f([dr.select(face // 2 == axis, side, p) for axis, p in enumerate(place)])
     on_box = Grid((1, 1, 1), medium.frame).world.point(u)
-    sigma_t = medium.sigma_t.at_world(medium.boundary.drawn_inside(on_box))
-    return float(np.quantile(np.array(dr.max(mi.Spectrum(sigma_t), axis=0)), 0.95))
+    return medium.boundary.drawn_inside(on_box)

@@ -148,16 +148,19 @@ def test_voxels_are_larger_in_smooth_light():
 
 def test_a_cut_boundary_needs_fewer_voxels_in_smooth_light():
     """Where nothing casts sharp shadows, the error at the boundary decreases faster with voxels."""
-    cut = np.full((4, 4, 4), 15.0)
+    cut, bright = np.full((4, 4, 4), 15.0), ConstantField(np.array([0.95]))
     assert in_light(cut, Detail.SHARP) == (75, 75, 75)
-    assert in_light(cut, Detail.SMOOTH) == (32, 32, 32)
-    matter = medium(np.full((4, 4, 4), 60.0)).replaced(context=MediumContext(detail=Detail.SMOOTH))
+    assert in_light(cut, Detail.SMOOTH, albedo=bright) == (45, 45, 45)
+    assert in_light(cut, Detail.SMOOTH, albedo=ConstantField(np.array([0.85]))) == (75, 75, 75)
+    smooth = {"context": MediumContext(detail=Detail.SMOOTH), "albedo": bright}
+    matter = medium(np.full((4, 4, 4), 36.0)).replaced(**smooth)
     grid, _ = choose_grid(matter, 0, solver_named("sweep").size_rule)
-    assert grid.shape == (127, 127, 127)
+    assert grid.shape == (108, 108, 108)
     assert grid_size.border_error(matter, grid) == pytest.approx(0.5, rel=0.02)  # rounded down
     # Estimates are never larger than without smooth light.
-    coarse = Grid((8, 8, 8), np.eye(4))
-    sharp = medium(np.full((4, 4, 4), 60.0))
+    coarse = Grid((2, 2, 2), np.eye(4))
+    sharp = medium(np.full((4, 4, 4), 600.0)).replaced(albedo=bright)
+    matter = sharp.replaced(**smooth)
     assert grid_size.border_error(matter, coarse) == grid_size.border_error(sharp, coarse)
 
 
