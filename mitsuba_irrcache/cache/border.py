@@ -27,6 +27,11 @@ from mitsuba_irrcache.media.medium import MediumGrid
 #: ratio of neighbouring values, which is as accurate in thinner voxels; and largest depth of the
 #: table, which stands for larger ones.
 THIN, RESOLVED, OPAQUE = 0.1, 0.2, 8.0
+#: The same limits, and the largest share of the profile, where the irradiance of suns, points and
+#: other emitters is looked up separately. The rest, once scattered first, has a profile between
+#: both: in a half-space under a sun at the zenith, with a depth of 0.5 per voxel, the ratio yields
+#: up to 5 % too much radiance, the profile up to 6 % too little.
+THIN_BESIDE_DIRECT, RESOLVED_BESIDE_DIRECT, SHARE_BESIDE_DIRECT = 0.25, 0.5, 0.5
 #: Cosine between camera rays and the normal of the boundary for which the profile between the
 #: boundary and the outermost voxel centres is approximated.
 COSINE = 0.6
@@ -46,12 +51,19 @@ class BorderProfile(Immutable):
             voxels at the faces are used.
         grid: the grid of the cache.
         single: whether radiance is scattered once only, so that the irradiance is uncollided.
+        has_direct: whether emitters are looked up separately, so that values lack their irradiance.
         means: whether values are means over voxels (solver ``sweep``), not values at their centres.
     """
 
-    def __init__(self, medium: MediumGrid, grid: Grid, single: bool, means: bool) -> None:
+    def __init__(
+        self, medium: MediumGrid, grid: Grid, single: bool, has_direct: bool, means: bool
+    ) -> None:
         self.medium, self.grid = medium, grid
         self.single, self.means = single, means
+        #: optical depths between which the share of the profile increases, and its maximum
+        self.limits = THIN, RESOLVED, 1.0
+        if has_direct and not single:
+            self.limits = THIN_BESIDE_DIRECT, RESOLVED_BESIDE_DIRECT, SHARE_BESIDE_DIRECT
 
     def at_centres(self, roots: mi.Float, known: mi.Bool, channels: int) -> mi.Float:
         """Convert square ``roots`` of means over the outermost voxels to roots at their centres.
@@ -122,7 +134,8 @@ class _Profile:
         albedo = dr.clip(1 - (1 - albedo) / dr.maximum(reduced, 1e-3), 0, 1)
         depth = extinction * dr.opaque(mi.Float, float(grid.voxel_size[axis]))
         #: share of this profile in the result
-        self.weight = dr.clip((depth - THIN) / (RESOLVED - THIN), 0, 1)
+        thin, resolved, most = border.limits
+        self.weight = dr.clip((depth - thin) * (most / (resolved - thin)), 0, most)
         self.weight = dr.select(_is_plain_face(medium, grid, axis, voxel), self.weight, 0)
 
         # Pairs are coefficients of A and B.

@@ -236,7 +236,8 @@ class CachedMedium:
             peak_depths = PeakDepths(medium, grid, active, basis.sources)
         border = None
         if border_depth(medium, grid) > THIN:
-            border = BorderProfile(medium, grid, settings.max_depth == 2, solver.is_correlated)
+            single, means = settings.max_depth == 2, solver.is_correlated
+            border = BorderProfile(medium, grid, single, bool(known), means)
         interpolation = Interpolation(basis, falloff, direct_lights, classes, peak_depths, border)
 
         def empty(fingerprint: dict[str, str]) -> IrradianceCache:
