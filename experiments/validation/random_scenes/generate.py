@@ -232,6 +232,9 @@ class RandomScene:
             return medium | {"scale": self.depth / (2 * SIDE)}
         density = self.voxels()[..., None] * (tint if self.is_chromatic else np.ones(1))
         medium |= {"type": "heterogeneous", "sigma_t": self._grid(density)}
+        # Otherwise volpath loses paths that leave opaque data long before they leave the boundary:
+        # the transmittance e^-(sigma_t s) by which it divides, for the length s in between, is 0.
+        medium["has_spectral_extinction"] = self.is_chromatic
         return medium | {"scale": 1 / (2 * SIDE)}
 
     def _albedo(self) -> dict:
