@@ -38,9 +38,9 @@ COSINE = 0.6
 #: Numbers of entries of the tables, over the optical depth and over the albedo.
 DEPTHS, ALBEDOS = 128, 128
 #: Columns of the table over the optical depth: the means of E_2 over the outermost voxel and over
-#: the next one, its values at their centres, and its weighted mean between boundary and centre,
-#: where the squared weights of linear interpolation have the last three means.
-OUTER, INNER, CENTRE, FURTHER, HALF, TO_CENTRE, MIXED, TO_FACE = range(COLUMNS := 8)
+#: the next one, its value at the centre of the first, and its weighted mean between boundary and
+#: centre, where the squared weights of linear interpolation have the last three means.
+OUTER, INNER, CENTRE, HALF, TO_CENTRE, MIXED, TO_FACE = range(COLUMNS := 7)
 
 
 class BorderProfile(Immutable):
@@ -52,14 +52,12 @@ class BorderProfile(Immutable):
         grid: the grid of the cache.
         single: whether radiance is scattered once only, so that the irradiance is uncollided.
         has_direct: whether emitters are looked up separately, so that values lack their irradiance.
-        means: whether values are means over voxels (solver ``sweep``), not values at their centres.
+
+    Values are means over voxels without noise, as those of the solver ``sweep``.
     """
 
-    def __init__(
-        self, medium: MediumGrid, grid: Grid, single: bool, has_direct: bool, means: bool
-    ) -> None:
-        self.medium, self.grid = medium, grid
-        self.single, self.means = single, means
+    def __init__(self, medium: MediumGrid, grid: Grid, single: bool, has_direct: bool) -> None:
+        self.medium, self.grid, self.single = medium, grid, single
         #: optical depths between which the share of the profile increases, and its maximum
         self.limits = THIN, RESOLVED, 1.0
         if has_direct and not single:
@@ -68,11 +66,8 @@ class BorderProfile(Immutable):
     def at_centres(self, roots: mi.Float, known: mi.Bool, channels: int) -> mi.Float:
         """Convert square ``roots`` of means over the outermost voxels to roots at their centres.
 
-        ``known`` are the voxels that have values; others are not changed, nor is anything if values
-        are those at the centres already.
+        ``known`` are the voxels that have values; others are not changed.
         """
-        if not self.means:
-            return roots
         index = dr.arange(mi.UInt32, self.grid.voxel_count * channels)
         voxel, result, stride = index // channels, roots, channels
         own = dr.gather(mi.Bool, known, voxel)
@@ -143,12 +138,9 @@ class _Profile:
         self._table = table = _Table(depth)
         decay, slope = _decay(albedo) * reduced, 1 / COSINE
         x, towards, both = decay * depth, 0.5 * slope * depth, 0.5 * (decay + slope) * depth
-        centre, outer = dr.exp(-0.5 * x), _mean_exponential(x)
-        self._centre = centre, table[CENTRE]
-        self._outer, self._inner = self._centre, (centre * dr.exp(-x), table[FURTHER])
-        if border.means:
-            self._outer = outer, table[OUTER]
-            self._inner = outer * dr.exp(-x), table[INNER]
+        outer = _mean_exponential(x)
+        self._outer, self._inner = (outer, table[OUTER]), (outer * dr.exp(-x), table[INNER])
+        self._centre = dr.exp(-0.5 * x), table[CENTRE]
         self._half = _mean_exponential(both) / _mean_exponential(towards), table[HALF]
 
     def centre(self, outermost: mi.Float, further: mi.Float) -> mi.Float:
@@ -262,9 +254,8 @@ def _depth_table() -> tuple[np.ndarray, float, float]:
         weight = w * np.exp(-0.5 * d * y / COSINE)
         weight /= weight.sum()
         between = np.array([_exponential_integrals(0.5 * d * t)[0] for t in y])
-        centre, further = (_exponential_integrals(n * d)[0] for n in (0.5, 1.5))
         rows.append([
-            (e3[0] - e3[1]) / d, (e3[1] - e3[2]) / d, centre, further,
+            (e3[0] - e3[1]) / d, (e3[1] - e3[2]) / d, _exponential_integrals(0.5 * d)[0],
             weight @ between, weight @ y**2, weight @ (y * (1 - y)), weight @ (1 - y) ** 2,
         ])  # fmt: skip
     return np.float32(rows), float(lowest), float((DEPTHS - 1) / (highest - lowest))

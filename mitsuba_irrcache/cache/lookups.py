@@ -28,7 +28,7 @@ def irradiance_field(
 ) -> RootField:
     """Create the field of `IrradianceCache.field`."""
     falloff, classes = interpolation.falloff, interpolation.voxel_classes
-    border = interpolation.border
+    border = None if sums.has_own_errors else interpolation.border
     lights = interpolation.direct_lights
     brightest = [dr.max(m)[0] for m in sums.irradiance()] if lights else []
     brightest += [light.maximum for light in lights]

@@ -235,9 +235,10 @@ class CachedMedium:
         if medium.original is not None and basis.sources and dr.width(active):
             peak_depths = PeakDepths(medium, grid, active, basis.sources)
         border = None
-        if border_depth(medium, grid) > THIN:
-            single, means = settings.max_depth == 2, solver.is_correlated
-            border = BorderProfile(medium, grid, single, bool(known), means)
+        # Noise would be amplified: of `path`, and of refracted light, which is sampled.
+        smooth = solver.is_correlated and not medium.refracts
+        if smooth and border_depth(medium, grid) > THIN:
+            border = BorderProfile(medium, grid, settings.max_depth == 2, bool(known))
         interpolation = Interpolation(basis, falloff, direct_lights, classes, peak_depths, border)
 
         def empty(fingerprint: dict[str, str]) -> IrradianceCache:

@@ -157,7 +157,7 @@ def _border_laws(medium: MediumGrid) -> list[tuple[float, float]]:
     the optical depth of a voxel; the smallest one applies.
     """
     laws = [(BORDER_ERROR, BORDER_ORDER)]
-    if medium.detail is not Detail.SHARP and _border_albedo(medium) >= HIGH_ALBEDO:
+    if medium.detail is not Detail.SHARP and _border_albedo(medium) > HIGH_ALBEDO - 1e-4:
         laws.append((SMOOTH_BORDER_ERROR, SMOOTH_BORDER_ORDER))
     return laws
 
