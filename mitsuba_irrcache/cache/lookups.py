@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular_field import AngularField
+from mitsuba_irrcache.cache.border import BorderProfile
 from mitsuba_irrcache.cache.conservative import conserving, share_of_noise
 from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.statistics import BatchSums, root_correction
@@ -13,6 +14,7 @@ from mitsuba_irrcache.core.spectrum import scatter_channels
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.grids.root_field import RootField
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 
 
 def on_grid(grid: Grid, active: mi.UInt32, values: list[mi.Float]) -> mi.TensorXf:
@@ -28,7 +30,6 @@ def irradiance_field(
 ) -> RootField:
     """Create the field of `IrradianceCache.field`."""
     falloff, classes = interpolation.falloff, interpolation.voxel_classes
-    border = None if sums.has_own_errors else interpolation.border
     lights = interpolation.direct_lights
     brightest = [dr.max(m)[0] for m in sums.irradiance()] if lights else []
     brightest += [light.maximum for light in lights]
@@ -50,17 +51,40 @@ def irradiance_field(
     values = on_grid(grid, active, roots).array
     if sums.has_own_errors:
         variance = on_grid(grid, active, noise[:channels]).array
-    separated = None if classes is None else classes.separated
-    if border is not None:
-        values = border.at_centres(values, known, channels)
-    values = conserving(grid, values, known, channels, share, separated)
-    if classes is not None:
-        values = classes.filled(values, channels)
-    field = RootField(grid, values, channels, variance, border)
+    border = border_of(sums, interpolation)
+    field = root_field(grid, values, known, channels, border, classes, share, variance)
     if falloff is not None:
         field.maximum *= falloff.maximum(active)
     field.maximum = max(field.maximum, *brightest, 0.0)
     return field
+
+
+def border_of(sums: BatchSums, interpolation: Interpolation) -> BorderProfile | None:
+    """Return the profile at the faces of the grid, or None if it would amplify noise of voxels."""
+    return None if sums.has_own_errors else interpolation.border
+
+
+def root_field(
+    grid: Grid,
+    roots: mi.Float,
+    known: mi.Bool,
+    channels: int,
+    border: BorderProfile | None,
+    classes: VoxelClasses | None = None,
+    share: mi.Float | None = None,
+    variance: mi.Float | None = None,
+) -> RootField:
+    """Create a field from square ``roots`` of the values of ``known`` voxels.
+
+    ``share`` is that of `conserving`, ``variance`` the relative variance of noisy values.
+    """
+    if border is not None:
+        roots = border.at_centres(roots, known, channels)
+    separated = None if classes is None else classes.separated
+    roots = conserving(grid, roots, known, channels, share, separated)
+    if classes is not None:
+        roots = classes.filled(roots, channels)
+    return RootField(grid, roots, channels, variance, border)
 
 
 def moment_field(

@@ -18,10 +18,11 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.angular_field import AngularField
+from mitsuba_irrcache.cache.border import BorderProfile
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.cache.display import as_html, as_text
 from mitsuba_irrcache.cache.interpolation import PLAIN, Interpolation
-from mitsuba_irrcache.cache.lookups import irradiance_field, moment_field, on_grid
+from mitsuba_irrcache.cache.lookups import border_of, irradiance_field, moment_field, on_grid
 from mitsuba_irrcache.cache.statistics import BATCH, BatchSums
 from mitsuba_irrcache.cache.storage import StoredCache, read_cache, read_description, write_cache
 from mitsuba_irrcache.errors import IrrcacheError
@@ -114,6 +115,12 @@ class IrradianceCache:
     def voxel_classes(self) -> VoxelClasses | None:
         """See `Interpolation`."""
         return self.interpolation.voxel_classes
+
+    @property
+    @_consistent
+    def border(self) -> BorderProfile | None:
+        """See `Interpolation`; None if values of neighbouring voxels have different noise."""
+        return border_of(self._sums, self.interpolation)
 
     def empty_copy(self, batch: int = 0) -> IrradianceCache:
         """Return a cache of the same voxels and settings without samples.

@@ -9,14 +9,13 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.angular_field import AngularField
-from mitsuba_irrcache.cache.conservative import conserving
 from mitsuba_irrcache.cache.direct_light import DirectLight, DirectLightAlongRays
+from mitsuba_irrcache.cache.lookups import root_field
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.gradients.replay import InScattering
 from mitsuba_irrcache.gradients.scattering import Components
 from mitsuba_irrcache.gradients.transport import AdjointTransport
-from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.media.phase import Phase
@@ -81,11 +80,9 @@ class FluenceFields:
             smooth = dr.rsqrt(falloff.of_voxels(voxels))
             roots = [r * smooth for r in roots]
         values = interleaved(roots, grid.voxel_count)
-        known, border = dr.full(mi.Bool, True, grid.voxel_count), cache.interpolation.border
-        if border is not None:
-            values = border.at_centres(values, known, channels)
-        values = conserving(grid, values, known, channels)
-        self.irradiance, self.falloff = RootField(grid, values, channels, border=border), falloff
+        known = dr.full(mi.Bool, True, grid.voxel_count)
+        self.irradiance = root_field(grid, values, known, channels, cache.border)
+        self.falloff = falloff
         if falloff is not None:
             self.irradiance.maximum *= falloff.maximum(voxels)
         maxima = [self.irradiance.maximum, brightest, *(light.maximum for light in lights)]

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.border import BorderProfile
-from mitsuba_irrcache.cache.conservative import conserving
+from mitsuba_irrcache.cache.lookups import root_field
 from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.core.sequences import (
     hashed_seed,
@@ -32,7 +32,6 @@ from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
 from mitsuba_irrcache.gradients.splatting import VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, TransportSettings
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 
 #: Maximum number of paths of a launch; number of paths from voxels for derivatives through the
@@ -53,12 +52,8 @@ class KnownFluence:
 
     def __init__(self, grid: Grid, values: list[mi.Float], border: BorderProfile | None) -> None:
         roots = [dr.sqrt(dr.maximum(v, 0)) for v in values]
-        flat, channels = interleaved(roots, grid.voxel_count), len(values)
-        known = dr.full(mi.Bool, True, grid.voxel_count)
-        if border is not None:
-            flat = border.at_centres(flat, known, channels)
-        flat = conserving(grid, flat, known, channels)
-        self.irradiance = RootField(grid, flat, channels, border=border)
+        flat, known = interleaved(roots, grid.voxel_count), dr.full(mi.Bool, True, grid.voxel_count)
+        self.irradiance = root_field(grid, flat, known, len(values), border)
         self.direct_lights = []
 
 
@@ -102,7 +97,7 @@ class CoupledMedium:
         self._update()
 
     def _update(self) -> None:
-        fluence = KnownFluence(self.grid, self.values, self.cache.interpolation.border)
+        fluence = KnownFluence(self.grid, self.values, self.cache.border)
         self.march = CameraReplay(self.medium, fluence, None, self.step)
 
     def scattered(self, source: list[mi.Float]) -> list[mi.Float]:

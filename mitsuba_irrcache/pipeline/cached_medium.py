@@ -235,9 +235,8 @@ class CachedMedium:
         if medium.original is not None and basis.sources and dr.width(active):
             peak_depths = PeakDepths(medium, grid, active, basis.sources)
         border = None
-        # Noise would be amplified: of `path`, and of refracted light, which is sampled.
-        smooth = solver.is_correlated and not medium.refracts
-        if smooth and border_depth(medium, grid) > THIN:
+        # Refracted light is sampled: its noise would be amplified.
+        if not medium.refracts and border_depth(medium, grid) > THIN:
             border = BorderProfile(medium, grid, settings.max_depth == 2, bool(known))
         interpolation = Interpolation(basis, falloff, direct_lights, classes, peak_depths, border)
 

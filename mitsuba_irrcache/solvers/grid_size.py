@@ -141,9 +141,8 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
         least, most = rule.among_surfaces.fewest, rule.among_surfaces.most
         extinction = max(_colliding_extinction(medium), _border_extinction(medium))
         longest = np.linalg.norm(frame[:3, :3], axis=0).max()
-        count = np.ceil(
-            extinction * longest / _edge_of_error(rule.among_surfaces.target_error, medium)
-        )
+        edge = _edge_of_error(rule.among_surfaces.target_error, medium)
+        count = np.ceil(extinction * longest / edge)
         count = max(count, 0 if data is None else max(data.shape))
         grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
         reason = f"by estimated error and data, {least} to {most} among surfaces"

@@ -323,8 +323,8 @@ MUTANTS = (
     Mutant(
         "interpolated roots do not keep the light",
         "cache/lookups.py",
-        "values = conserving(grid, values, known, channels, share, separated)",
-        "values = values + 0",
+        "roots = conserving(grid, roots, known, channels, share, separated)",
+        "roots = roots + 0",
         ("tests/unit/cache/test_lookups.py",),
     ),
     Mutant(

@@ -11,8 +11,8 @@ pixels in the middle, and of the whole image (RMSE), in %.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import dataclass
+from unittest import mock
 
 import mitsuba as mi
 import numpy as np
@@ -81,14 +81,9 @@ CASES = [
 ]
 
 
-@contextmanager
 def uncompensated():
     """Neglect numerical diffusion."""
-    least, antidiffusion.NEGLIGIBLE_DEPTH = antidiffusion.NEGLIGIBLE_DEPTH, np.inf
-    try:
-        yield
-    finally:
-        antidiffusion.NEGLIGIBLE_DEPTH = least
+    return mock.patch.object(antidiffusion, "NEGLIGIBLE_DEPTH", np.inf)
 
 
 def row(case: DarkSide) -> list[str]:

@@ -15,7 +15,7 @@ over 4 x 4 pixels.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from unittest import mock
 
 import mitsuba as mi
 import numpy as np
@@ -87,14 +87,12 @@ def rendered(depth: float, albedo: float, max_depth: int, mu: float) -> float:
 def cube_image(depth: float, albedo: float, spp: int, **integrator) -> tuple[np.ndarray, mi.Scene]:
     """Return means over blocks of the image of a whole cube, and the scene."""
     look = mi.ScalarTransform4f().look_at([2.6, 2.2, -3.6], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": CUBE_PIXELS, "height": CUBE_PIXELS}
+    size = {"width": CUBE_PIXELS, "height": CUBE_PIXELS}
+    film = {"type": "hdrfilm", "rfilter": {"type": "box"}} | size
     scene = mi.load_dict({
         "type": "scene",
         "integrator": integrator | {"hide_emitters": True},
-        "sensor": {
-            "type": "perspective", "fov": 35, "to_world": look,
-            "film": film | {"rfilter": {"type": "box"}},
-        },
+        "sensor": {"type": "perspective", "fov": 35, "to_world": look, "film": film},
         "environment": {"type": "constant", "radiance": 1.0},
         "cube": cube(depth, albedo),
     })  # fmt: skip
@@ -118,18 +116,23 @@ def cube_row(depth: float, albedo: float, max_depth: int) -> list[str]:
         error = 100 * (image - fine) / fine.mean()
         rmse = np.sqrt(np.square(error).mean())
         cells += [f"{error.mean():+.2f}", f"{rmse:.2f}", f"{np.abs(error).max():.1f}"]
-    scattering = "single" if max_depth == 2 else "all orders"
-    return [scattering, f"{albedo:g}", f"{depth:g}", f"{max(medium.cache.grid.shape)}", *cells]
+    return [
+        scattering(max_depth),
+        f"{albedo:g}",
+        f"{depth:g}",
+        f"{max(medium.cache.grid.shape)}",
+        *cells,
+    ]
 
 
-@contextmanager
 def without_profile():
     """Extrapolate to the faces by the ratio of the two outermost values, as in thin media."""
-    thin, cached_medium.THIN = cached_medium.THIN, np.inf
-    try:
-        yield
-    finally:
-        cached_medium.THIN = thin
+    return mock.patch.object(cached_medium, "THIN", np.inf)
+
+
+def scattering(max_depth: int) -> str:
+    """Return the first cell of a row."""
+    return "single" if max_depth == 2 else "all orders"
 
 
 def row(albedo: float, max_depth: int, mu: float) -> list[str]:
@@ -140,7 +143,7 @@ def row(albedo: float, max_depth: int, mu: float) -> list[str]:
             before = rendered(depth, albedo, max_depth, mu) / expected - 1
         found = rendered(depth, albedo, max_depth, mu) / expected - 1
         cells.append(f"{100 * before:+.1f}, {100 * found:+.1f}")
-    return ["single" if max_depth == 2 else "all orders", f"{albedo:g}", f"{mu:g}", *cells]
+    return [scattering(max_depth), f"{albedo:g}", f"{mu:g}", *cells]
 
 
 def main() -> None:
