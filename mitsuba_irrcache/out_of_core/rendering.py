@@ -34,7 +34,10 @@ from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.fingerprint import SceneVersion, digests
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.extinction import DENSE
-from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import (
+    DistantIllumination,
+    samples_in_isolated_media,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
 from mitsuba_irrcache.solvers.sweep import DEFAULT_DIRECTIONS
 
@@ -193,7 +196,8 @@ class MappedMedium:
         pairs = -(-samples // MULTIPLE) * MULTIPLE // 2
         rng = np.random.default_rng((self._settings.seed, 0))
         channels = 1 if mi.is_monochromatic else 3
-        illumination = DistantIllumination(scene)
+        samples = samples_in_isolated_media(not all_orders)
+        illumination = DistantIllumination(scene, samples=samples)
         if all_orders and self._medium.albedo.channels > 1:
             return illumination.ordinates(1, pairs, rng)[0], np.ones(channels)
         sets, colour = illumination.factored_ordinates(1, pairs, channels, rng)

@@ -93,11 +93,11 @@ AMONG_SURFACES = {
 }
 
 
-# Among the others, one has the lamps, one has all orders.
+# The one that is always run has the lamps; others have two media and a forward peak.
 @pytest.mark.parametrize(
     ("build", "depth", "bounds"),
     [
-        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name == "lamps"))
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name != "lamps, single"))
         for name, case in AMONG_SURFACES.items()
     ],
 )

@@ -104,7 +104,10 @@ def errors(scenes, name: str, sigma_t: float = SIGMA_T, ball: dict | None = None
 
 
 @pytest.mark.usefixtures("mono")
-@pytest.mark.parametrize("name", LAMPS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * ("cube" in name)) for name in LAMPS],
+)
 def test_single_scattering(scenes, name):
     """Single scattering next to emitters agrees with quadrature, with 16 voxels along an edge.
 

@@ -8,6 +8,7 @@ no code with irrcache.
 
 from __future__ import annotations
 
+from collections.abc import Container, Iterable
 from functools import lru_cache
 
 import mitsuba as mi
@@ -69,6 +70,27 @@ ORDERS = {
     Case("point outside", max_depth=-1): (64, 512, 0.0025),
 }
 
+#: Cases that `make stress` runs, which differ from others in one property.
+SLOW = {
+    Case("rectangle far"),
+    Case("sphere near"),
+    Case("disk near", "rayleigh"),
+    Case("rectangle near", "hg 0.58"),
+    Case("sphere near", "hg -0.4"),
+    Case("directional", max_depth=-1),
+    Case("point outside", max_depth=-1),
+    *WIDE,
+}
+SLOW_PATH = {Case("disk near"), Case("rectangle near", "hg 0.58")}
+
+
+def parameters(cases: Iterable[Case], slow: Container[Case] = SLOW) -> list:
+    """Return test parameters, of which those that are ``slow`` are marked."""
+    return [
+        pytest.param(case, id=case.name, marks=[pytest.mark.slow] * (case in slow))
+        for case in cases
+    ]
+
 
 @lru_cache
 def exact(case: Case) -> float:
@@ -99,7 +121,7 @@ def test_sweep_of_delta_lights(case):
     assert abs(fine) < 0.0015
 
 
-@pytest.mark.parametrize("case", WIDE, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", parameters(WIDE))
 def test_sweep_of_wide_emitters(case):
     """With emitters wider than the medium, a resolution of 64 is not within 0.1 %, 96 is."""
     settings = {"solver": "sweep", "cache_spp": 32}
@@ -108,21 +130,21 @@ def test_sweep_of_wide_emitters(case):
     assert abs(fine) < 0.001
 
 
-@pytest.mark.parametrize("case", SWEEP, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", parameters(SWEEP))
 def test_sweep(case):
     resolution, samples, bound = SWEEP[case]
     settings = {"solver": "sweep", "resolution": resolution, "cache_spp": samples}
     assert abs(error(case, exact(case), **settings)) < bound
 
 
-@pytest.mark.parametrize("case", PATH, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", parameters(PATH, SLOW_PATH))
 def test_path(case):
     resolution, samples, bound = PATH[case]
     settings = {"solver": "path", "resolution": resolution, "cache_spp": samples}
     assert abs(error(case, exact(case), **settings)) < bound
 
 
-@pytest.mark.parametrize("case", ORDERS, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", parameters(ORDERS))
 def test_all_orders(case):
     resolution, samples, bound = ORDERS[case]
     expected, noise = orders(case, 1 << 21)

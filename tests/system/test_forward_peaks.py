@@ -116,10 +116,13 @@ def test_against_the_light(kind, angle, depth, g, albedo, tint):
     assert block < 0.06 + 2 * noise
 
 
+OTHER_SHADOWS = [("lamp", 0), ("point", 1)]
+
+
 @pytest.mark.parametrize(
     ("kind", "objects"),
     # `test_against_the_light` has the lamp, too.
-    [("sun", 0), pytest.param("lamp", 0, marks=pytest.mark.slow), ("point", 1)],
+    [("sun", 0), *(pytest.param(*case, marks=pytest.mark.slow) for case in OTHER_SHADOWS)],
     ids=["sun", "lamp", "point, gloss"],
 )
 def test_shadows(kind, objects):

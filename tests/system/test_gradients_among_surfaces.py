@@ -33,7 +33,7 @@ def fewer_paths(monkeypatch):
     ("name", "parameters"),
     [
         ("ground, sky", ("sigma_t", "floor")),
-        ("lamp", ("albedo", "lamp")),
+        pytest.param("lamp", ("albedo", "lamp"), marks=pytest.mark.slow),
         ("two media, sky", ("sigma_t", "other.interior_medium.sigma_t")),
         ("distant object, empty voxels", ("sigma_t",)),
     ],

@@ -43,7 +43,9 @@ def furnace(size: float, reflectance: float) -> dict:
 
 
 # Walls within a voxel, next to the sides of the box, and on sides of voxels.
-@pytest.mark.parametrize("size", [1.2, 1.0001, 4 / 3])
+@pytest.mark.parametrize(
+    "size", [1.2, *(pytest.param(size, marks=pytest.mark.slow) for size in (1.0001, 4 / 3))]
+)
 def test_a_furnace_has_radiance_one(scenes, size):
     """The radiance is 1 in the room, and 0 outside: no radiance passes through the walls."""
     image, cache = rendered(scenes, furnace(size, 0.5), spp=16)
@@ -136,7 +138,14 @@ def object_named(name: str) -> dict:
 
 @pytest.mark.parametrize(
     ("name", "depth"),
-    [*((name, -1) for name in NAMES), ("two-sided sheet", 2), ("luminous ball", 2)],
+    [
+        *(
+            pytest.param(name, -1, marks=[pytest.mark.slow] * (name in ("rod", "luminous ball")))
+            for name in NAMES
+        ),
+        ("two-sided sheet", 2),
+        ("luminous ball", 2),
+    ],
 )
 def test_voxels_equal_those_of_the_solver_path(scenes, name, depth):
     """The irradiance of both solvers agrees: in the mean within 1.5 %, in blocks of voxels within

@@ -157,6 +157,7 @@ def test_transfer_functions_and_archives_are_exchanged(browser, reachable, tmp_p
     assert difference(again, back) < 1.5
 
 
+@pytest.mark.slow
 def test_cameras_and_environment_of_a_scene_with_surfaces(browser, tmp_path, scenes):
     """The viewer offers a scene's cameras, rotates its environment and compares with volpath.
 

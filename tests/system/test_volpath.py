@@ -187,7 +187,13 @@ def _bright_window() -> np.ndarray:
     return sky
 
 
-@pytest.mark.parametrize("emitter", EMITTERS.values(), ids=EMITTERS)
+@pytest.mark.parametrize(
+    "emitter",
+    [
+        pytest.param(emitter, id=name, marks=[pytest.mark.slow] * (name == "spot"))
+        for name, emitter in EMITTERS.items()
+    ],
+)
 def test_emitters(scenes, compare, emitter):
     """Each kind of emitter agrees; sharp shadows require more voxels and shorter steps than a
     sky.

@@ -40,7 +40,11 @@ from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import (
     EmitterSampling,
     split_by_solid_angle,
 )
-from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import (
+    FEW_SAMPLES,
+    DistantIllumination,
+    samples_in_isolated_media,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import interleaved_channels
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
@@ -110,7 +114,11 @@ class Sweep:
     ) -> None:
         """``rr_depth`` applies to paths between surfaces; ``pause`` is called after each launch."""
         self.cache, self.seed = cache, seed
-        self._illumination = DistantIllumination(scene, medium.emission is not None)
+        samples = FEW_SAMPLES
+        if medium.is_isolated:
+            is_single_isotropic = cache.max_depth == 2 and not cache.moments
+            samples = samples_in_isolated_media(is_single_isotropic)
+        self._illumination = DistantIllumination(scene, medium.emission is not None, samples)
         if not cache.active_count:
             return
         self._medium = medium
