@@ -8,7 +8,9 @@ between voxels. At the optical depth t from the boundary it is about
 with the asymptotic decay k of radiance in the medium, which depends on the albedo (Case and
 Zweifel, *Linear Transport Theory*, 1967, chapter 4), and the exponential integral E_2: uncollided
 radiance of a uniform environment is proportional to E_2(t), a medium without absorption under such
-an environment has k = 0 and B = 0. A and B follow from the values of the two outermost voxels.
+an environment has k = 0 and B = 0. Radiance that enters at grazing angles, from a bright region of
+an environment, decays faster: then an exponential takes the place of E_2. All parameters follow
+from the values of the three outermost voxels.
 """
 
 from __future__ import annotations
@@ -35,12 +37,19 @@ THIN_BESIDE_DIRECT, RESOLVED_BESIDE_DIRECT, SHARE_BESIDE_DIRECT = 0.25, 0.5, 0.5
 #: Cosine between camera rays and the normal of the boundary for which the profile between the
 #: boundary and the outermost voxel centres is approximated.
 COSINE = 0.6
+#: Relative range of the decay per voxel, below that of E_2, over which the exponential gradually
+#: takes the place of E_2, and its minimum.
+BLENDED, STEEPEST = 0.25, 0.02
 #: Numbers of entries of the tables, over the optical depth and over the albedo.
 DEPTHS, ALBEDOS = 128, 128
-#: Columns of the table over the optical depth: the means of E_2 over the outermost voxel and over
-#: the next one, its value at the centre of the first, and its weighted mean between boundary and
-#: centre, where the squared weights of linear interpolation have the last three means.
-OUTER, INNER, CENTRE, HALF, TO_CENTRE, MIXED, TO_FACE = range(COLUMNS := 7)
+#: Columns of the table over the optical depth: the means of E_2 over the three outermost voxels and
+#: its value at the centre of the first; then weighted means over the outer half of the outermost
+#: voxel, of E_2 and of the squared weights of linear interpolation between face and centre; and the
+#: same over its inner half, of interpolation between its centre and the next one.
+(
+    OUTER, INNER, THIRD, CENTRE, OUTER_HALF, TO_CENTRE, MIXED, TO_FACE,
+    INNER_HALF, FROM_CENTRE, MIXED_INWARDS, TO_INNER,
+) = range(COLUMNS := 12)  # fmt: skip
 
 
 class BorderProfile(Immutable):
@@ -52,74 +61,82 @@ class BorderProfile(Immutable):
         grid: the grid of the cache.
         single: whether radiance is scattered once only, so that the irradiance is uncollided.
         has_direct: whether emitters are looked up separately, so that values lack their irradiance.
+        depth: optical depth of a voxel at the boundary.
 
     Values are means over voxels without noise, as those of the solver ``sweep``.
     """
 
-    def __init__(self, medium: MediumGrid, grid: Grid, single: bool, has_direct: bool) -> None:
-        self.medium, self.grid, self.single = medium, grid, single
+    def __init__(
+        self, medium: MediumGrid, grid: Grid, single: bool, has_direct: bool, depth: float
+    ) -> None:
+        self.medium, self.grid, self.single, self.depth = medium, grid, single, depth
         #: optical depths between which the share of the profile increases, and its maximum
         self.limits = THIN, RESOLVED, 1.0
         if has_direct and not single:
             self.limits = THIN_BESIDE_DIRECT, RESOLVED_BESIDE_DIRECT, SHARE_BESIDE_DIRECT
 
-    def at_centres(self, roots: mi.Float, known: mi.Bool, channels: int) -> mi.Float:
-        """Convert square ``roots`` of means over the outermost voxels to roots at their centres.
+    def fitted(self, roots: mi.Float, known: mi.Bool, channels: int) -> FittedBorder:
+        """Fit the profile to the square ``roots`` of the means over voxels.
 
-        ``known`` are the voxels that have values; others are not changed.
+        ``known`` are the voxels that have values.
         """
-        index = dr.arange(mi.UInt32, self.grid.voxel_count * channels)
-        voxel, result, stride = index // channels, roots, channels
-        own = dr.gather(mi.Bool, known, voxel)
-        sides = zip(self.grid.voxel_indices(voxel), self.grid.sides, strict=True)
+        return FittedBorder(self, roots, known, channels)
+
+
+class FittedBorder(Immutable):
+    """The profile at the faces of a grid for given values, see `BorderProfile.fitted`."""
+
+    def __init__(
+        self, border: BorderProfile, roots: mi.Float, known: mi.Bool, channels: int
+    ) -> None:
+        self.border, self.roots, self.known, self.channels = border, roots, known, channels
+
+    def at_centres(self) -> mi.Float:
+        """Return the roots, those of the outermost voxels at their centres.
+
+        Linear interpolation between these and the next ones has the weighted mean of the profile
+        over the inner half of the outermost voxels.
+        """
+        grid, channels, result = self.border.grid, self.channels, self.roots
+        index = dr.arange(mi.UInt32, grid.voxel_count * channels)
+        voxel = index // channels
+        sides = zip(grid.voxel_indices(voxel), grid.sides, strict=True)
         for axis, (place, side) in enumerate(sides):
             last = mi.UInt32(side) - 1
-            at_face = own & (last > 0) & ((place == 0) | (place == last))
-            step = dr.select(place == 0, stride, -stride)
-            inner = mi.UInt32(mi.Int32(index) + step)
-            at_face &= dr.gather(mi.Bool, known, inner // channels, at_face)
+            at_face = dr.gather(mi.Bool, self.known, voxel)
+            at_face &= (last > 0) & ((place == 0) | (place == last))
             profile = _Profile(self, axis, voxel, index - voxel * channels, at_face)
-            outermost = dr.square(roots)
-            further = dr.square(dr.gather(mi.Float, roots, inner, at_face))
-            value = profile.centre(outermost, further)
-            ratio = dr.select(outermost > 0, value / dr.maximum(outermost, 1e-30), 1)
-            ratio = dr.sqrt(dr.lerp(1, ratio, profile.weight))
-            result = dr.select(at_face, result * ratio, result)
-            stride *= self.grid.shape[2 - axis]
+            ratio = dr.select(self.roots > 0, profile.centre() / dr.maximum(self.roots, 1e-15), 1)
+            result = dr.select(at_face, result * dr.lerp(1, ratio, profile.weight), result)
         dr.eval(result)
         return result
 
     def growth(
-        self,
-        axis: int,
-        voxel: mi.UInt32,
-        channel: mi.UInt32,
-        roots: tuple[mi.Float, mi.Float],
-        ratio: mi.Float,
-        active: mi.Bool,
+        self, axis: int, voxel: mi.UInt32, channel: mi.UInt32, ratio: mi.Float, active: mi.Bool
     ) -> mi.Float:
-        """Return the ratio of the root one voxel beyond a face to that at the outermost centre.
+        """Return the ratio of the root one voxel beyond a face normal to an ``axis`` to that at the
+        centre of the outermost ``voxel``.
 
-        ``roots`` are those at the centre of the outermost ``voxel`` along an ``axis``, and of the
-        next one inwards. ``ratio`` is returned where the medium is thin.
+        ``ratio`` is returned where the medium is thin.
         """
         profile = _Profile(self, axis, voxel, channel, active)
-        return dr.lerp(ratio, profile.growth(*roots), profile.weight)
+        return dr.lerp(ratio, profile.growth(), profile.weight)
 
 
 class _Profile:
-    """A and B of the profile, for the voxels at faces normal to an ``axis``."""
+    """The profile at the outermost ``voxel`` along an ``axis``."""
 
-    # docs/primer, eq. (2.13)
+    # docs/primer, eqs. (2.13), (2.14)
 
     def __init__(
         self,
-        border: BorderProfile,
+        fitted: FittedBorder,
         axis: int,
         voxel: mi.UInt32,
         channel: mi.UInt32,
         active: mi.Bool,
     ) -> None:
+        border = fitted.border
         medium, grid = border.medium, border.grid
         p = grid.centers(voxel)
         extinction = _channel(medium.sigma_t.at_world(p, active), channel)
@@ -128,42 +145,111 @@ class _Profile:
         reduced = 1 - albedo * dr.opaque(mi.Float, float(medium.phase.moments[1]))
         albedo = dr.clip(1 - (1 - albedo) / dr.maximum(reduced, 1e-3), 0, 1)
         depth = extinction * dr.opaque(mi.Float, float(grid.voxel_size[axis]))
+
+        # Read the three outermost values.
+        place, side = grid.voxel_indices(voxel)[axis], grid.sides[axis]
+        stride = dr.opaque(mi.Int32, int(np.prod(grid.resolution[:axis], dtype=int)))
+        step = dr.select(place == 0, stride, -stride)
+        roots, is_known = [], active
+        for k in range(3):
+            at = mi.UInt32(mi.Int32(voxel) + k * step)
+            is_known = is_known & (mi.UInt32(side) > k)
+            is_known &= dr.gather(mi.Bool, fitted.known, at, is_known)
+            roots.append(
+                dr.gather(mi.Float, fitted.roots, at * fitted.channels + channel, is_known)
+            )
+            if k == 1:
+                has_inner = is_known
+        self._roots = roots
+        first, second, third = (dr.square(root) for root in roots)
+
         #: share of this profile in the result
         thin, resolved, most = border.limits
         self.weight = dr.clip((depth - thin) * (most / (resolved - thin)), 0, most)
-        self.weight = dr.select(_is_plain_face(medium, grid, axis, voxel), self.weight, 0)
+        is_plain = has_inner & _is_plain_face(medium, grid, axis, voxel)
+        self.weight = dr.select(is_plain, self.weight, 0)
 
-        # Pairs are coefficients of A and B.
+        # Fit A and B, with E_2 and with the exponential in its place.
         depth = dr.clip(depth, THIN, OPAQUE)
         self._table = table = _Table(depth)
         decay, slope = _decay(albedo) * reduced, 1 / COSINE
-        x, towards, both = decay * depth, 0.5 * slope * depth, 0.5 * (decay + slope) * depth
-        outer = _mean_exponential(x)
-        self._outer, self._inner = (outer, table[OUTER]), (outer * dr.exp(-x), table[INNER])
-        self._centre = dr.exp(-0.5 * x), table[CENTRE]
-        self._half = _mean_exponential(both) / _mean_exponential(towards), table[HALF]
+        slow = _Exponential(decay, depth, slope)
+        per_voxel = dr.exp(-decay * depth)
+        a, b = _solved(slow.outer, slow.inner, table[OUTER], table[INNER], first, second)
+        diffuse = (table[INNER] * per_voxel - table[THIRD]) / (
+            table[OUTER] * per_voxel - table[INNER]
+        )
+        # The part that decays as e^(-k t) cancels in these differences.
+        rest, next_rest = first * per_voxel - second, second * per_voxel - third
+        found = is_known & (rest > 0) & (next_rest > 0)
+        share = next_rest / dr.select(found, rest, 1) / diffuse
+        steep_share = dr.select(found, dr.clip((1 - share) * (1 / BLENDED), 0, 1), 0)
+        steep = _Exponential(
+            -dr.log(dr.clip(share * diffuse, STEEPEST, 0.999)) / depth, depth, slope
+        )
+        c, d = _solved(slow.outer, slow.inner, steep.outer, steep.inner, first, second)
+        #: coefficients, and values of the functions at the centre of the outermost voxel, in the
+        #: mean over its outer half, and in that over its inner half
+        self._terms = [
+            (dr.lerp(a, c, steep_share), slow.values),
+            (b * (1 - steep_share), (table[CENTRE], table[OUTER_HALF], table[INNER_HALF])),
+            (d * steep_share, steep.values),
+        ]
 
-    def centre(self, outermost: mi.Float, further: mi.Float) -> mi.Float:
-        """Return Phi at the outermost centres, from the means over the two outermost voxels."""
-        a, b = _solved(self._outer, self._inner, outermost, further)
-        value = a * self._centre[0] + b * self._centre[1]
-        largest = 1.1 * dr.maximum(outermost, 0.5 * (outermost + further))
-        return dr.clip(value, 0.05 * outermost, largest)
+    def _values(self) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Return Phi at the centre of the outermost voxel, and its weighted means over the outer
+        and the inner half, within bounds relative to the means over voxels.
+        """
+        sums = (sum(c * values[i] for c, values in self._terms) for i in range(3))
+        centre, outer_half, inner_half = sums
+        outermost, inner = (dr.square(root) for root in self._roots[:2])
+        bounds = 0.05 * outermost, 1.1 * dr.maximum(outermost, 0.5 * (outermost + inner))
+        return dr.clip(centre, *bounds), dr.maximum(outer_half, 0), dr.clip(inner_half, *bounds)
 
-    def growth(self, outermost: mi.Float, further: mi.Float) -> mi.Float:
+    def centre(self) -> mi.Float:
+        """Return the root at the outermost centre, see `FittedBorder.at_centres`."""
+        table, (_, inner, third) = self._table, self._roots
+        value, _, inner_half = self._values()
+        # The next root is reduced by `conserving`.
+        mixed = (dr.sqrt(value) + 4 * inner + dr.select(third > 0, third, inner)) * (1 / 6)
+        inner = inner * dr.sqrt(dr.select(mixed > 0, inner / mixed, 1))
+        return _end(inner_half, table[FROM_CENTRE], table[MIXED_INWARDS], table[TO_INNER], inner)
+
+    def growth(self) -> mi.Float:
         """Return the ratio of the root beyond the face to that at the outermost centre.
 
         Linear interpolation of roots between both has the same weighted mean as the profile.
         """
-        phi = dr.square(outermost)
-        a, b = _solved(self._centre, self._inner, phi, dr.square(further))
-        table, scale = self._table, dr.select(phi > 0, dr.rcp(phi), 0)
-        mean = dr.maximum((a * self._half[0] + b * self._half[1]) * scale, 0)
-        # The root f at the face solves w_ff f^2 + 2 w_fc f + w_cc = mean, in units of the centre's.
-        mixed, to_face = table[MIXED], table[TO_FACE]
-        rest = dr.maximum(mean - table[TO_CENTRE], 0)
-        face = rest / (mixed + dr.sqrt(dr.fma(mixed, mixed, to_face * rest)))
-        return dr.maximum(2 * face - 1, 0)
+        table, centre = self._table, self.centre()
+        _, outer_half, _ = self._values()
+        face = _end(outer_half, table[TO_FACE], table[MIXED], table[TO_CENTRE], centre)
+        return dr.maximum(2 * face * dr.select(centre > 0, dr.rcp(centre), 0) - 1, 0)
+
+
+class _Exponential:
+    """Means of e^(-k t) over the ``outer`` and the next ``inner`` voxel, and its ``values``: at the
+    centre of the outermost voxel, and in the weighted means over its outer and inner half.
+    """
+
+    def __init__(self, decay: mi.Float, depth: mi.Float, slope: float) -> None:
+        x = decay * depth
+        self.outer, centre = _mean_exponential(x), dr.exp(-0.5 * x)
+        self.inner = self.outer * dr.exp(-x)
+        both, weight = 0.5 * (decay + slope) * depth, 0.5 * slope * depth
+        outer_half = _mean_exponential(both) / _mean_exponential(weight)
+        self.values = centre, outer_half, outer_half * centre
+
+
+def _end(
+    mean: mi.Float, own: mi.Float, mixed: mi.Float, others: mi.Float, other: mi.Float
+) -> mi.Float:
+    """Return the root at one end of a line whose square has the weighted ``mean``, given that at
+    the ``other`` end, and the weighted means of the squared weights of both ends.
+    """
+    rest = dr.maximum(mean - others * dr.square(other), 0)
+    mixed = mixed * other
+    total = mixed + dr.sqrt(dr.fma(mixed, mixed, own * rest))
+    return dr.select(total > 0, rest / dr.maximum(total, 1e-30), 0)
 
 
 def _is_plain_face(medium: MediumGrid, grid: Grid, axis: int, voxel: mi.UInt32) -> mi.Bool:
@@ -180,13 +266,14 @@ def _is_plain_face(medium: MediumGrid, grid: Grid, axis: int, voxel: mi.UInt32) 
     return medium.contains(grid.centers(voxel) + outwards) & ~at_edge
 
 
-def _solved(first: tuple, second: tuple, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Solve A f + B g = u, v for A and B, with (f, g) as ``first`` and ``second``.
+def _solved(
+    f0: mi.Float, f1: mi.Float, g0: mi.Float, g1: mi.Float, u: mi.Float, v: mi.Float
+) -> tuple[mi.Float, mi.Float]:
+    """Solve A f + B g = u, v for A and B, with the components (f0, f1) of f and (g0, g1) of g.
 
     A is not negative: where the second value is too small, for instance because voxels are opaque
     and it is inaccurate, the first one determines B.
     """
-    (f0, g0), (f1, g1) = first, second
     a = dr.maximum((u * g1 - v * g0) / (f0 * g1 - f1 * g0), 0)
     return a, (u - a * f0) / g0
 
@@ -250,14 +337,17 @@ def _depth_table() -> tuple[np.ndarray, float, float]:
     y, w = (0.5 * (x + 1)) ** 2, 0.5 * w * (x + 1)  # E_2 has an infinite slope at 0
     rows = []
     for d in np.exp2(np.linspace(lowest, highest, DEPTHS)):
-        e3 = [0.5, *(_exponential_integrals(n * d)[1] for n in (1.0, 2.0))]
+        e3 = [0.5, *(_exponential_integrals(n * d)[1] for n in (1.0, 2.0, 3.0))]
+        row = [(e3[n] - e3[n + 1]) / d for n in range(3)]
+        row.append(_exponential_integrals(0.5 * d)[0])
         weight = w * np.exp(-0.5 * d * y / COSINE)
         weight /= weight.sum()
-        between = np.array([_exponential_integrals(0.5 * d * t)[0] for t in y])
-        rows.append([
-            (e3[0] - e3[1]) / d, (e3[1] - e3[2]) / d, _exponential_integrals(0.5 * d)[0],
-            weight @ between, weight @ y**2, weight @ (y * (1 - y)), weight @ (1 - y) ** 2,
-        ])  # fmt: skip
+        # Own weight of the end that is sought: of the face, and of the centre.
+        for first, own in ((0.0, 1 - y), (0.5 * d, 1 - 0.5 * y)):
+            values = np.array([_exponential_integrals(first + 0.5 * d * t)[0] for t in y])
+            means = [weight @ (1 - own) ** 2, weight @ (own * (1 - own)), weight @ own**2]
+            row += [weight @ values, *(means if first == 0 else means[::-1])]
+        rows.append(row)
     return np.float32(rows), float(lowest), float((DEPTHS - 1) / (highest - lowest))
 
 

@@ -78,13 +78,15 @@ def root_field(
 
     ``share`` is that of `conserving`, ``variance`` the relative variance of noisy values.
     """
+    fitted = None
     if border is not None:
-        roots = border.at_centres(roots, known, channels)
+        fitted = border.fitted(roots, known, channels)
+        roots = fitted.at_centres()
     separated = None if classes is None else classes.separated
     roots = conserving(grid, roots, known, channels, share, separated)
     if classes is not None:
         roots = classes.filled(roots, channels)
-    return RootField(grid, roots, channels, variance, border)
+    return RootField(grid, roots, channels, variance, fitted)
 
 
 def moment_field(

@@ -16,16 +16,10 @@ STEEPEST = 4.0
 
 
 class Border(Protocol):
-    """The profile of a field at the faces of its grid, see `BorderProfile`."""
+    """The profile of a field at the faces of its grid, see `FittedBorder`."""
 
     def growth(
-        self,
-        axis: int,
-        voxel: mi.UInt32,
-        channel: mi.UInt32,
-        roots: tuple[mi.Float, mi.Float],
-        ratio: mi.Float,
-        active: mi.Bool,
+        self, axis: int, voxel: mi.UInt32, channel: mi.UInt32, ratio: mi.Float, active: mi.Bool
     ) -> mi.Float:
         """Return the ratio of the root one voxel beyond a face to that at the outermost centre."""
 
@@ -174,7 +168,7 @@ def extrapolated(
             noise = dr.gather(mi.Float, variance, inside * channels + channel)
             ratio = ratio * (1 - 0.36 * (noise + dr.gather(mi.Float, variance, place)))
         if border is not None:
-            ratio = border.growth(axis, inside, channel, (outermost, other), ratio, known)
+            ratio = border.growth(axis, inside, channel, ratio, known)
         result = dr.select(known, result * ratio, result)
     dr.eval(result)
     return result

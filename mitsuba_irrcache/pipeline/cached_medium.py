@@ -210,7 +210,7 @@ class CachedMedium:
         settings, medium, solver = self.settings, self.medium, self.solver
         grid, basis = self.grid, self._basis
         if settings.warns:
-            warn_of_dense_border(medium, grid)
+            warn_of_dense_border(medium, grid, settings.max_depth)
             if not warn_of_opaque_voxels(medium, grid, settings.max_depth):
                 warn_of_unresolved_detail(medium, grid)
         active, classes = self._active_voxels(scene, grid)
@@ -236,8 +236,9 @@ class CachedMedium:
             peak_depths = PeakDepths(medium, grid, active, basis.sources)
         border = None
         # Refracted light is sampled: its noise would be amplified.
-        if not medium.refracts and border_depth(medium, grid) > THIN:
-            border = BorderProfile(medium, grid, settings.max_depth == 2, bool(known))
+        depth = 0.0 if medium.refracts else border_depth(medium, grid)
+        if depth > THIN:
+            border = BorderProfile(medium, grid, settings.max_depth == 2, bool(known), depth)
         interpolation = Interpolation(basis, falloff, direct_lights, classes, peak_depths, border)
 
         def empty(fingerprint: dict[str, str]) -> IrradianceCache:

@@ -119,7 +119,7 @@ def needs_no_cache(
     error *= max_depth != 2  # single scattering is exact
     grid, _ = choose_grid(medium, 0, SweepSolver.size_rule)
     depth = medium.sigma_t.maximum * grid.voxel_size.max()
-    cached = border_error(medium, grid)
+    cached = border_error(medium, grid, max_depth)
     if cached <= max(error, 1.2 * TARGET_ERROR):
         return None
     return (

@@ -80,7 +80,16 @@ def camera_rays_of(
             falloff=cache.falloff,
             direct_lights=_along_rays(cache),
         )
-        projection = Projection(medium, field, quadrature, step, layered, cached)
+        border = cache.interpolation.border
+        projection = Projection(
+            medium,
+            field,
+            quadrature,
+            step,
+            layered,
+            cached,
+            border_depth=0.0 if border is None else border.depth,
+        )
         del field  # already copied by the projection
         release_unused_memory(cache.grid.voxel_count)
         return projection

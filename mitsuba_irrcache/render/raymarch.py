@@ -44,6 +44,9 @@ EARLY_STOP = 1e-4
 #: Below these fractions of remaining radiance, steps are two and four times as long: their larger
 #: error affects only a small remainder.
 COARSER, COARSEST = 0.2, 0.03
+#: Optical depth of a step above which it is divided where the medium is dense at its boundary, into
+#: at most MOST_SUBSTEPS: the irradiance there decays within a fraction of a mean free path.
+SUBSTEP_DEPTH, MOST_SUBSTEPS = 0.15, 8
 #: Maximum optical depth per step of the packed extinction: the 16-bit format has a limited range,
 #: which larger values would waste.
 OPAQUE = 4096.0
@@ -105,8 +108,11 @@ class Projection:
         layered: bool = False,
         cached: CachedFields = IRRADIANCE_ALONE,
         lookups: Callable = Lookups,
+        border_depth: float = 0.0,
     ) -> None:
-        """``lookups`` is called with the fields that rays read, and their limits."""
+        """``lookups`` is called with the fields that rays read, and their limits; ``border_depth``
+        is the optical depth of a voxel at the boundary.
+        """
         self.medium, self._exponent = medium, None
         if medium.unscattered_exponent is not None:
             opaque = [dr.opaque(mi.Float, float(e)) for e in medium.unscattered_exponent]
@@ -124,6 +130,13 @@ class Projection:
         grids = [f.grid for f in fields if f and f.grid]
         # For constant fields, one step is exact.
         length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
+        #: number of steps of the lattice into which a step is divided where the medium is dense;
+        #: None: no step is divided
+        self.substeps = None
+        depth = border_depth * step
+        if depth > SUBSTEP_DEPTH and RULES[quadrature].is_third_order and np.isfinite(length):
+            count = min(2 ** int(np.ceil(np.log2(depth / SUBSTEP_DEPTH))), MOST_SUBSTEPS)
+            self.substeps, length = dr.opaque(mi.Float, count), length / count
         self.step = dr.opaque(mi.Float, float(length))
         #: shortest edge of a voxel of the cache or, without one, of the medium
         on_grid = irradiance is not None and irradiance.grid is not None
@@ -382,7 +395,7 @@ class _MarchState:
     """What a ray carries from segment to segment.
 
     Points of the lattice of steps are numbered. ``k`` is the number of the last evaluated one plus
-    1, ``stride`` the number of steps from it to the next one (1, 2 or 4), ``t`` the distance of the
+    1, ``stride`` the number of steps from it to the next one, ``t`` the distance of the
     last one and ``here`` the fields there. ``previous`` and ``previous_length`` belong to the
     segment before. ``peak`` is that of `Projection.fetch`, and ``means`` are the mean extinctions
     towards the direct lights.
@@ -620,7 +633,13 @@ class _RayMarch:
         state.active &= remaining > EARLY_STOP * accumulated
         if RULES[self._projection.quadrature].is_third_order:
             stride = dr.select(remaining > COARSER * accumulated, mi.Float(1), 2)
-            state.stride = dr.select(remaining > COARSEST * accumulated, stride, 4)
+            stride = dr.select(remaining > COARSEST * accumulated, stride, 4)
+            if self._projection.substeps is not None:
+                extinction = dr.max(mi.Spectrum(state.here.extinction))
+                depth = dr.maximum(extinction * self._projection.step, 1e-6)
+                count = dr.floor(SUBSTEP_DEPTH * dr.rcp(depth))
+                stride *= dr.clip(count, 1, self._projection.substeps)
+            state.stride = stride
 
 
 def _simplified(field: Field) -> Field:

@@ -38,17 +38,16 @@ STEP = kronecker_steps(2)[0]
 PAIRS_PER_SUN_TRACKS = 8
 #: Number of directions sampled from an environment map, per pair of ordinates of a pass: few where
 #: each of them is expensive, if the map has bright regions; many for isolated media, if the map has
-#: angular detail; fewer for single isotropic scattering, whose default number of ordinates is twice
-#: as large. Under a bright window a dense ball has a noise of 2.7 % with few samples, and of 1 %
-#: with many, in twice the time (experiments/validation/maps).
-FEW_SAMPLES, SAMPLES_OF_SINGLE_SCATTERING, MANY_SAMPLES = 0.5, 2.0, 4.0
+#: angular detail. Their number is smaller for single scattering, whose default number of ordinates
+#: is twice as large, and for anisotropic scattering, where each of them costs more time. Under a
+#: bright window a dense ball has a noise of 2.7 % with few samples, and of 1 % with many, in twice
+#: the time (experiments/validation/maps).
+FEW_SAMPLES, SEVERAL_SAMPLES, MANY_SAMPLES = 0.5, 2.0, 4.0
 
 
-def samples_in_isolated_media(is_single_isotropic: bool) -> float:
-    """Return the number of directions per pair of ordinates to sample for isolated media, given
-    whether scattering is single and isotropic.
-    """
-    return SAMPLES_OF_SINGLE_SCATTERING if is_single_isotropic else MANY_SAMPLES
+def samples_in_isolated_media(max_depth: int, is_isotropic: bool) -> float:
+    """Return the number of directions per pair of ordinates that are sampled for isolated media."""
+    return SEVERAL_SAMPLES if max_depth == 2 or not is_isotropic else MANY_SAMPLES
 
 
 class DistantIllumination:

@@ -116,8 +116,7 @@ class Sweep:
         self.cache, self.seed = cache, seed
         samples = FEW_SAMPLES
         if medium.is_isolated:
-            is_single_isotropic = cache.max_depth == 2 and not cache.moments
-            samples = samples_in_isolated_media(is_single_isotropic)
+            samples = samples_in_isolated_media(cache.max_depth, not cache.moments)
         self._illumination = DistantIllumination(scene, medium.emission is not None, samples)
         if not cache.active_count:
             return
@@ -202,7 +201,9 @@ class Sweep:
         # the active voxels.
         data = medium.sigma_t.grid
         sparse = data is not None and detail.shape == data.shape and medium.fills(grid)
-        rest = *box, detail, cache.active, sparse, pause, self._surfaces
+        # With further orders, the sum of uncollided and scattered irradiance does not depend on it.
+        has_dense_faces = cache.interpolation.border is not None and cache.max_depth == 2
+        rest = *box, detail, cache.active, sparse, pause, self._surfaces, has_dense_faces
         self._tracks = [Tracks(grid, sigma_t, *rest) for sigma_t in extinction]
         self._levels: dict[tuple[int, ...], MultigridLevel] = {}
         # Single scattering does not need the albedo here: lookups multiply by it.

@@ -56,6 +56,9 @@ from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup, T
 #: centres: a mean over a unit square smooths with variance 1/12 along both axes, whose effect is
 #: half of that times the second derivative (Taylor expansion).
 SECOND_DIFFERENCE = 1 / 24
+#: Number of layers of voxels at each face of a grid whose means are computed instead of values at
+#: their centres, where the medium is dense there: those to which `cache/border` fits a profile.
+LAYERS = 3
 #: Number of voxels up to which one launch sweeps all ordinates, each into a copy of the volume. The
 #: copies are added in a fixed order, because atomic sums are not reproducible.
 SMALL_GRID = 40**3
@@ -70,7 +73,8 @@ class Tracks:
     the same box (None: the same grid). Results are computed at the voxels ``active`` (flat indices;
     None: all). ``sparse`` states that the extinction is 0 in all other voxels, so that sweeps may
     skip empty space. ``pause`` is called after every launch (see `CacheBuilder.pause`).
-    ``surfaces`` are the voxels near surfaces, None without any.
+    ``surfaces`` are the voxels near surfaces, None without any. ``has_dense_faces`` states that
+    uncollided irradiance is computed as means over the voxels in `LAYERS` at the grid's faces.
     """
 
     def __init__(
@@ -84,8 +88,9 @@ class Tracks:
         sparse: bool = False,
         pause: Callable[[], None] = lambda: None,
         surfaces: SurfaceVoxels | None = None,
+        has_dense_faces: bool = False,
     ) -> None:
-        self.surfaces = surfaces
+        self.surfaces, self.has_dense_faces = surfaces, has_dense_faces
         self.grid, self.extinction_grid = grid, extinction_grid or grid
         self.pause = pause
         self.lower, self.size = np.array(lower), np.array(upper) - np.array(lower)
@@ -156,7 +161,8 @@ class Tracks:
         offsets: np.ndarray,
         boundary_source: Callable | None = None,
     ) -> mi.Float:
-        """Compute the uncollided irradiance at the centres of the active voxels.
+        """Compute the uncollided irradiance at the centres of the active voxels, or means over them
+        at dense faces.
 
         The radiance that enters along pairs of ordinates is ``incoming``, as in `table`, or the
         `BoundarySource` that ``boundary_source(table)`` returns. The result has the values of one
@@ -165,6 +171,7 @@ class Tracks:
         table = self.table(directions, incoming, np.zeros(len(incoming)), offsets, by_slice=True)
         table.boundary_source = boundary_source(table) if boundary_source is not None else None
         box = self.lower, self.lower + self.size
+        layers = LAYERS if self.has_dense_faces else 0
         channels = (table if table.boundary_source is None else table.boundary_source).channels
         active = self.active_count
         total = dr.opaque(mi.Float, 0, active * channels)
@@ -174,7 +181,7 @@ class Tracks:
             for c in range(channels):
                 where = SweptBox(self.grid, *box, axis), self.active, c, channels
                 cut = None if self.surfaces is None else self.surfaces.is_cut
-                values = values_at_centres(volume, *where, cut=cut)
+                values = values_at_centres(volume, *where, cut=cut, layers=layers)
                 index = dr.arange(mi.UInt32, active)
                 index = index + dr.opaque(mi.UInt32, active * c) if c else index
                 # In place: a sum would be a second array.
@@ -323,6 +330,7 @@ def values_at_centres(
     channels: int = 1,
     begin: mi.UInt32 | int = 0,
     cut: mi.Bool | None = None,
+    layers: int = 0,
 ) -> mi.Float:
     """Return values at the centres of the voxels ``index`` of a box.
 
@@ -332,8 +340,11 @@ def values_at_centres(
     both transverse axes undo the smoothing. Results are never negative. ``means`` are laid out by
     slices, starting at ``begin``, with several ``channels``, of which ``channel`` is used. Second
     differences are omitted in voxels ``cut`` by surfaces, and next to them.
+
+    In the outermost ``layers`` of voxels at each face of the grid, results are means over the voxel
+    along the normal of the face instead, where values are in the middle along the box's axis.
     """
-    # docs/primer, eq. (4.5)
+    # docs/primer, eqs. (2.15), (4.5)
     grid, lower, upper, axis = box
     places, strides = grid.voxel_indices(index), strides_of(grid.resolution, slicewise(axis))
     place = flat_index(places, strides) + begin
@@ -342,9 +353,9 @@ def values_at_centres(
         i = i if channels == 1 else i * channels + channel
         return dr.gather(mi.Float, means, i, active)
 
-    value, change = read(place), mi.Float(0)
+    value, change, factor = read(place), mi.Float(0), mi.Float(1)
     for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
-        if k == axis or upper[k] - lower[k] < 3:
+        if (k == axis and not layers) or upper[k] - lower[k] < 3:
             continue
         stride, first, last = (dr.opaque(mi.UInt32, n) for n in (stride, lower[k], upper[k] - 1))
         # A voxel beside the box may lie on the border of the grid, with no neighbour beyond it.
@@ -356,8 +367,30 @@ def values_at_centres(
         is_lit = (below > 0) & (above > 0)
         if cut is not None:
             is_lit &= ~_any_cut(grid, cut, places, k, (at == first, at == last), inside)
-        change += dr.select(is_lit, 2 * here - below - above, 0)
-    return dr.maximum(dr.fma(change, dr.opaque(mi.Float, SECOND_DIFFERENCE), value), 0)
+        second = dr.select(is_lit, below + above - 2 * here, 0)
+        if layers:
+            side = dr.opaque(mi.UInt32, grid.resolution[k])
+            in_layers = (at < layers) | (at + layers >= side)
+            if k == axis:
+                mean = _mean_over_value(second / dr.select(is_lit, here, 1))
+                factor = dr.select(in_layers & is_lit, mean, 1)
+                continue
+            second = dr.select(in_layers, 0, second)
+        change -= second
+    value = dr.maximum(dr.fma(change, dr.opaque(mi.Float, SECOND_DIFFERENCE), value), 0)
+    return value * factor if layers else value
+
+
+def _mean_over_value(curvature: mi.Float) -> mi.Float:
+    """Return the mean of a function over a voxel, over its value at the centre.
+
+    ``curvature`` is its second difference between voxels, over the value. The result is exact for
+    exponentials, and for cosines, whose second differences are negative.
+    """
+    s = 0.5 * dr.sqrt(dr.abs(curvature))
+    steep = dr.maximum(s, 1e-2)
+    angle = dr.select(curvature > 0, dr.asinh(steep), dr.asin(dr.minimum(steep, 1)))
+    return dr.select(s < 1e-2, 1 + curvature * SECOND_DIFFERENCE, steep / angle)
 
 
 def _any_cut(
