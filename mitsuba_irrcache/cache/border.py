@@ -29,11 +29,6 @@ from mitsuba_irrcache.media.medium import MediumGrid
 #: ratio of neighbouring values, which is as accurate in thinner voxels; and largest depth of the
 #: table, which stands for larger ones.
 THIN, RESOLVED, OPAQUE = 0.1, 0.2, 8.0
-#: The same limits, and the largest share of the profile, where the irradiance of suns, points and
-#: other emitters is looked up separately. The rest, once scattered first, has a profile between
-#: both: in a half-space under a sun at the zenith, with a depth of 0.5 per voxel, the ratio yields
-#: up to 5 % too much radiance, the profile up to 6 % too little.
-THIN_BESIDE_DIRECT, RESOLVED_BESIDE_DIRECT, SHARE_BESIDE_DIRECT = 0.25, 0.5, 0.5
 #: Cosine between camera rays and the normal of the boundary for which the profile between the
 #: boundary and the outermost voxel centres is approximated.
 COSINE = 0.6
@@ -60,20 +55,13 @@ class BorderProfile(Immutable):
             voxels at the faces are used.
         grid: the grid of the cache.
         single: whether radiance is scattered once only, so that the irradiance is uncollided.
-        has_direct: whether emitters are looked up separately, so that values lack their irradiance.
         depth: optical depth of a voxel at the boundary.
 
     Values are means over voxels without noise, as those of the solver ``sweep``.
     """
 
-    def __init__(
-        self, medium: MediumGrid, grid: Grid, single: bool, has_direct: bool, depth: float
-    ) -> None:
+    def __init__(self, medium: MediumGrid, grid: Grid, single: bool, depth: float) -> None:
         self.medium, self.grid, self.single, self.depth = medium, grid, single, depth
-        #: optical depths between which the share of the profile increases, and its maximum
-        self.limits = THIN, RESOLVED, 1.0
-        if has_direct and not single:
-            self.limits = THIN_BESIDE_DIRECT, RESOLVED_BESIDE_DIRECT, SHARE_BESIDE_DIRECT
 
     def fitted(self, roots: mi.Float, known: mi.Bool, channels: int) -> FittedBorder:
         """Fit the profile to the square ``roots`` of the means over voxels.
@@ -164,8 +152,7 @@ class _Profile:
         first, second, third = (dr.square(root) for root in roots)
 
         #: share of this profile in the result
-        thin, resolved, most = border.limits
-        self.weight = dr.clip((depth - thin) * (most / (resolved - thin)), 0, most)
+        self.weight = dr.clip((depth - THIN) * (1 / (RESOLVED - THIN)), 0, 1)
         is_plain = has_inner & _is_plain_face(medium, grid, axis, voxel)
         self.weight = dr.select(is_plain, self.weight, 0)
 

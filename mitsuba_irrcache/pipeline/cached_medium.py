@@ -238,7 +238,7 @@ class CachedMedium:
         # Refracted light is sampled: its noise would be amplified.
         depth = 0.0 if medium.refracts else border_depth(medium, grid)
         if depth > THIN:
-            border = BorderProfile(medium, grid, settings.max_depth == 2, bool(known), depth)
+            border = BorderProfile(medium, grid, settings.max_depth == 2, depth)
         interpolation = Interpolation(basis, falloff, direct_lights, classes, peak_depths, border)
 
         def empty(fingerprint: dict[str, str]) -> IrradianceCache:
