@@ -7,7 +7,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.validation.dense_faces.run import SPP, VOXELS, cube, face, radiance, rendered
+from experiments.validation.dense_faces.run import (
+    SPP,
+    VOXELS,
+    cube,
+    cube_image,
+    face,
+    radiance,
+    rendered,
+)
 from mitsuba_irrcache.cache import border
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -72,6 +80,24 @@ def test_window_of_an_environment_map(depth, incident, mu):
     solver = {"type": "irrcache", "solver": "sweep", "resolution": VOXELS, "max_depth": 2}
     image = face(solver, cube(depth * VOXELS, 0.8), mu, SPP, environment)
     assert image.mean() == pytest.approx(expected, rel=0.025)
+
+
+@pytest.mark.parametrize(("albedo", "bound"), [(0.5, 0.011), (0.9, 0.01)])
+def test_cube_under_a_sun(albedo, bound):
+    """A cube of 0.5 optical depths per voxel under a sun agrees with one of four times as many
+    voxels, in means over 8 x 8 pixels.
+
+    Its scattered irradiance is interpolated without that of the sun. With the ratio of the two
+    outermost values the errors were 1.6 and 1.8 % of the mean.
+    """
+    sun = {"type": "directional", "direction": [-0.6, -0.5, 0.62], "irradiance": 3.0}
+    body, images = cube(15, albedo), []
+    for resolution in (30, 120):
+        solver = {"type": "irrcache", "solver": "sweep", "resolution": resolution}
+        image, _ = cube_image(body, 64, sun, **solver)
+        images.append(image)
+    coarse, fine = images
+    assert np.sqrt(np.square(coarse - fine).mean()) < bound * fine.mean()
 
 
 def test_tables():

@@ -27,6 +27,7 @@ from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.pipeline import cached_medium, defaults
 
 VOXELS, PIXELS, SPP = 48, 16, 256
+UNIFORM = {"type": "constant", "radiance": 1.0}
 DEPTHS, COSINES = (0.5, 1.0, 2.0), (1.0, 0.5)
 #: Albedo and ``max_depth``.
 CASES = ((0.8, 2), (0.5, -1), (0.8, -1), (0.95, -1))
@@ -93,14 +94,18 @@ def face(
         "type": "scene",
         "integrator": integrator | {"hide_emitters": True},
         "sensor": {"type": "orthographic", "to_world": camera, "film": film},
-        "environment": environment or {"type": "constant", "radiance": 1.0},
+        "environment": environment or UNIFORM,
         "cube": body,
     })  # fmt: skip
     return np.array(mi.render(scene, spp=spp), np.float64)
 
 
-def cube_image(body: dict, spp: int, **integrator) -> tuple[np.ndarray, mi.Scene]:
-    """Return means over blocks of the image of a whole cube, and the scene."""
+def cube_image(
+    body: dict, spp: int, environment: dict | None = None, **integrator
+) -> tuple[np.ndarray, mi.Scene]:
+    """Return means over blocks of the image of a whole cube in an ``environment`` (None: uniform
+    radiance), and the scene.
+    """
     look = mi.ScalarTransform4f().look_at([2.6, 2.2, -3.6], [0, 0, 0], [0, 1, 0])
     size = {"width": CUBE_PIXELS, "height": CUBE_PIXELS}
     film = {"type": "hdrfilm", "rfilter": {"type": "box"}} | size
@@ -108,7 +113,7 @@ def cube_image(body: dict, spp: int, **integrator) -> tuple[np.ndarray, mi.Scene
         "type": "scene",
         "integrator": integrator | {"hide_emitters": True},
         "sensor": {"type": "perspective", "fov": 35, "to_world": look, "film": film},
-        "environment": {"type": "constant", "radiance": 1.0},
+        "environment": environment or UNIFORM,
         "cube": body,
     })  # fmt: skip
     image, count = np.array(mi.render(scene, spp=spp), np.float64)[..., 0], CUBE_PIXELS // BLOCK
