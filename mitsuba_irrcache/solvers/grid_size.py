@@ -46,7 +46,7 @@ SMOOTH_BORDER_ERROR, SMOOTH_BORDER_ORDER, HIGH_ALBEDO = 2.1, 1.3, 0.9
 #: least CURVED_ERROR (1 - a)^ABSORBED_ORDER d^CURVED_ORDER with the albedo a at the boundary, 0 for
 #: single scattering, where it is larger than that of a box. Found with balls of 48^3 voxels in
 #: uniform light, for 0.2 <= d <= 0.8.
-CURVED_ERROR, ABSORBED_ORDER, CURVED_ORDER = 22.0, 0.7, 1.9
+CURVED_ERROR, ABSORBED_ORDER, CURVED_ORDER = 6.0, 0.5, 1.4
 #: RMSE [% of the mean] of an image with all orders of scattering through data with opaque detail as
 #: fine as their voxels: OPAQUE_ERROR d^OPAQUE_DEPTH_ORDER r^OPAQUE_SIZE_ORDER at most, with the
 #: optical depth d of a data voxel and the ratio r of the edges of cache and data voxels. Found with

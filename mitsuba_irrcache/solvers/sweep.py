@@ -18,6 +18,7 @@ from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
 from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, minimum_batch
 from mitsuba_irrcache.solvers.discrete_ordinates.refracted_light import is_needed
+from mitsuba_irrcache.solvers.discrete_ordinates.resampling import MOST_REFINED
 from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.grid_size import TARGET_ERROR, SizeRule, choose_grid
 from mitsuba_irrcache.transport.path import Media
@@ -146,6 +147,8 @@ class SweepSolver(Solver):
         once = max_depth == 2
         sets = channels if sn_solver.swept_together(medium, voxels, moments) else 1
         numbers = 5 + 2 * channels + (0 if once else 5 + 12 * sets + 3 * channels)
+        if voxels <= MOST_REFINED and medium.boundary.kind != "box":
+            numbers += 32  # the extinction may have half the edges
         return numbers + moments * (3 * channels + (4 if once else 10) * sets)
 
     @classmethod

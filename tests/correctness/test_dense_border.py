@@ -15,6 +15,7 @@ from experiments.validation.dense_faces.run import (
     face,
     radiance,
     rendered,
+    single_scattering,
 )
 from mitsuba_irrcache.cache import border
 
@@ -98,6 +99,22 @@ def test_cube_under_a_sun(albedo, bound):
         images.append(image)
     coarse, fine = images
     assert np.sqrt(np.square(coarse - fine).mean()) < bound * fine.mean()
+
+
+@pytest.mark.parametrize(("depth", "bound"), [(0.2, 0.012), (0.4, 0.015), (0.8, 0.055)])
+def test_ball(depth, bound):
+    """Single scattering in a ball of 48^3 voxels of these optical depths agrees with that which is
+    sampled without a cache, in means over 4 x 4 pixels.
+
+    When tracks read the extinction at the voxels alone, whose interpolation blurs the boundary, the
+    errors were 0.5, 3.9 and 15 %.
+    """
+    ball = {"shape": "sphere"}
+    exact = single_scattering(cube(48 * depth, 0.8, homogeneous=True, **ball))
+    solver = {"type": "irrcache", "solver": "sweep", "resolution": 48, "max_depth": 2}
+    found, _ = cube_image(cube(48 * depth, 0.8, **ball), 64, **solver)
+    error = np.sqrt(np.square(found - exact).mean()) / exact.mean()
+    assert error < bound
 
 
 def test_tables():

@@ -60,18 +60,18 @@ def radiance(albedo: float, max_depth: int, mu: float) -> float:
     return float(1 - np.sqrt(1 - albedo) * half_space_h(albedo, mu))
 
 
-def cube(depth: float, albedo: float, homogeneous: bool = False) -> dict:
+def cube(depth: float, albedo: float, homogeneous: bool = False, shape: str = "cube") -> dict:
     """Return the cube [-1, 1]^3 with this optical depth along an edge, with a grid of equal values
-    or ``homogeneous``.
+    or ``homogeneous``; or another ``shape`` of the same size.
     """
     if homogeneous:
         medium = {"type": "homogeneous", "sigma_t": 0.5 * depth, "albedo": albedo}
-        return {"type": "cube", "bsdf": {"type": "null"}, "interior": medium}
+        return {"type": shape, "bsdf": {"type": "null"}, "interior": medium}
     values = np.full((2, 2, 2, 1), 0.5 * depth, np.float32)
     place = mi.ScalarTransform4f().translate(-1).scale(2)
     volume = {"type": "gridvolume", "grid": mi.VolumeGrid(values), "to_world": place, "raw": True}
     medium = {"type": "heterogeneous", "sigma_t": volume, "albedo": albedo}
-    return {"type": "cube", "bsdf": {"type": "null"}, "interior": medium}
+    return {"type": shape, "bsdf": {"type": "null"}, "interior": medium}
 
 
 def rendered(depth: float, albedo: float, max_depth: int, mu: float) -> float:
@@ -120,12 +120,18 @@ def cube_image(
     return image.reshape(count, BLOCK, count, BLOCK).mean(axis=(1, 3)), scene
 
 
+def single_scattering(body: dict) -> np.ndarray:
+    """Return means over blocks of an image of a homogeneous body, sampled along camera rays."""
+    with mock.patch.object(defaults, "TARGET_ERROR", -1.0):  # whatever error a cache would have
+        image, _ = cube_image(body, REFERENCE_SPP, type="irrcache", max_depth=2)
+    return image
+
+
 def cube_row(depth: float, albedo: float, max_depth: int) -> list[str]:
     """Return the cells of a whole cube at default settings."""
     ours, body = {"type": "irrcache", "max_depth": max_depth}, cube(depth, albedo)
     if max_depth == 2:
-        with mock.patch.object(defaults, "TARGET_ERROR", -1.0):  # whatever a cache would cost
-            fine, _ = cube_image(cube(depth, albedo, homogeneous=True), REFERENCE_SPP, **ours)
+        fine = single_scattering(cube(depth, albedo, homogeneous=True))
     else:
         fine, _ = cube_image(body, CUBE_SPP, **ours, resolution=FINE)
     with without_profile():

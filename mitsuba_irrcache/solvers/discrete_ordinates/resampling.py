@@ -22,17 +22,25 @@ FINEST = 4
 RADAU = (1 / 6, 3 / 8), (1 / 2, 1 / 4), (5 / 6, 3 / 8)
 #: Approximate number of extinction values along each axis of a voxel.
 DETAIL = 2
+#: Maximum number of voxels of a grid whose extinction is refined at dense boundaries that cut them:
+#: sweeps then read 128 bytes more per voxel.
+MOST_REFINED = 1 << 21
 
 
-def extinction_grid(medium: MediumGrid, grid: Grid) -> Grid:
+def extinction_grid(medium: MediumGrid, grid: Grid, has_dense_boundary: bool = False) -> Grid:
     """Return the grid on which tracks read the extinction.
 
     If ``grid`` and the medium's grid cover the same box, it is the medium's grid or, if ``grid`` is
     much coarser, a grid of blocks of its voxels, about `DETAIL` per voxel along each axis.
-    Otherwise it is ``grid``.
+    Otherwise it is ``grid``, or a grid of half its edges if voxels are cut by a dense boundary,
+    which interpolation of the extinction blurs.
     """
     data = medium.sigma_t.grid
-    if data is None or not medium.fills(grid) or not medium.fills(data):
+    if not medium.fills(grid):
+        if has_dense_boundary and grid.voxel_count <= MOST_REFINED:
+            return Grid(tuple(DETAIL * n for n in grid.shape), grid.to_world)
+        return grid
+    if data is None or not medium.fills(data):
         return grid
     block = np.maximum(np.rint(data.resolution / (DETAIL * grid.resolution)), 1).astype(int)
     block = np.where(data.resolution % block == 0, block, 1)

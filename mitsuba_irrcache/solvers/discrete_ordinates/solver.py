@@ -194,7 +194,8 @@ class Sweep:
         if medium.refracts:
             # Tracks end at the glass, so the extinction of voxels that it cuts must not be reduced.
             medium = medium.replaced(boundary=Boundary("box", medium.boundary.to_world))
-        detail = extinction_grid(medium, grid)
+        is_dense = cache.interpolation.border is not None
+        detail = extinction_grid(medium, grid, is_dense)
         extinction = resampled(medium, medium.sigma_t, detail)
         box = occupied_box(grid, cache.active)
         # The extinction of blocks of the medium's voxels, or of rotated voxels, may extend beyond
@@ -202,7 +203,7 @@ class Sweep:
         data = medium.sigma_t.grid
         sparse = data is not None and detail.shape == data.shape and medium.fills(grid)
         # With further orders, the sum of uncollided and scattered irradiance does not depend on it.
-        has_dense_faces = cache.interpolation.border is not None and cache.max_depth == 2
+        has_dense_faces = is_dense and cache.max_depth == 2
         rest = *box, detail, cache.active, sparse, pause, self._surfaces, has_dense_faces
         self._tracks = [Tracks(grid, sigma_t, *rest) for sigma_t in extinction]
         self._levels: dict[tuple[int, ...], MultigridLevel] = {}

@@ -250,10 +250,10 @@ def test_the_border_of_a_sphere_is_its_surface():
     sphere = cube.replaced(boundary=Boundary("sphere", cube.boundary.to_world))
     voxels = Grid((16, 16, 16), np.eye(4))
     assert grid_size.border_error(cube, voxels) < 0.1 * grid_size.border_error(sphere, voxels)
-    expected = 22 * 0.5**0.7 * 0.5**1.9  # an albedo and a depth per voxel of 0.5
+    expected = 6 * 0.5**0.5 * 0.5**1.4  # an albedo and a depth per voxel of 0.5
     assert grid_size.border_error(sphere, voxels) == pytest.approx(expected, rel=0.1)
     single = grid_size.border_error(sphere, voxels, max_depth=2)
-    assert single == pytest.approx(22 * 0.5**1.9, rel=0.1)
+    assert single == pytest.approx(6 * 0.5**1.4, rel=0.1)
 
 
 def test_dense_detail_needs_more_voxels():
