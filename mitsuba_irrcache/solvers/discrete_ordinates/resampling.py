@@ -50,11 +50,14 @@ def extinction_grid(medium: MediumGrid, grid: Grid, has_dense_boundary: bool = F
     return data if (block == 1).all() else Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
 
 
-def resampled(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
+def resampled(
+    medium: MediumGrid, field: Field, grid: Grid, points_if_cut: int = FINEST
+) -> list[mi.Float]:
     """Return the channels of ``field`` at the voxels of ``grid``.
 
     Values are means over voxels if these are larger than the field's, or if the boundary of the
-    medium may cut them; outside of the boundary the field counts as 0.
+    medium may cut them, then over at least ``points_if_cut`` points along each axis; outside of the
+    boundary the field counts as 0.
     """
     cut = not medium.fills(grid)
     if field.grid is not None and not cut:
@@ -62,7 +65,7 @@ def resampled(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
         if not rest.any() and np.prod(block) <= FINEST**3 and medium.fills(field.grid):
             return _blocks(field, grid, block)
     ratio = 1.0 if field.grid is None else (grid.voxel_size / field.grid.voxel_size).max()
-    points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
+    points = int(np.clip(np.ceil(ratio - 1e-3), points_if_cut if cut else 1, FINEST))
     index = dr.arange(mi.UInt32, grid.voxel_count)
     values = _mean(medium, field, grid, index, points, cut)
     dr.eval(values)

@@ -57,6 +57,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.refracted_light import (
     refracted_irradiance,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
+    DETAIL,
+    FINEST,
     collision_albedo,
     extinction_grid,
     resampled,
@@ -196,7 +198,8 @@ class Sweep:
             medium = medium.replaced(boundary=Boundary("box", medium.boundary.to_world))
         is_dense = cache.interpolation.border is not None
         detail = extinction_grid(medium, grid, is_dense)
-        extinction = resampled(medium, medium.sigma_t, detail)
+        points = FINEST // DETAIL if detail.voxel_count > grid.voxel_count else FINEST
+        extinction = resampled(medium, medium.sigma_t, detail, points)
         box = occupied_box(grid, cache.active)
         # The extinction of blocks of the medium's voxels, or of rotated voxels, may extend beyond
         # the active voxels.
