@@ -123,8 +123,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - step
        - |float|
-       - Step length, relative to the shortest voxel edge of the medium and the cache.
-         (Default: 1.0)
+       - Step length, relative to the shortest voxel edge of the medium and the cache. Where the
+         medium is dense up to its boundary, ``exponential`` divides steps further. (Default: 1.0)
 
      * - filter
        - |string|

@@ -196,8 +196,8 @@ class MappedMedium:
         pairs = -(-samples // MULTIPLE) * MULTIPLE // 2
         rng = np.random.default_rng((self._settings.seed, 0))
         channels = 1 if mi.is_monochromatic else 3
-        samples = samples_in_isolated_media(self._settings.max_depth, True)
-        illumination = DistantIllumination(scene, samples=samples)
+        sampling = samples_in_isolated_media(self._settings.max_depth, True)
+        illumination = DistantIllumination(scene, False, *sampling)
         if all_orders and self._medium.albedo.channels > 1:
             return illumination.ordinates(1, pairs, rng)[0], np.ones(channels)
         sets, colour = illumination.factored_ordinates(1, pairs, channels, rng)

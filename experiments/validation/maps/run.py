@@ -114,7 +114,7 @@ def noise(body: dict, environment: dict, seeds: int = SEEDS) -> tuple[float, flo
 
 def with_few_samples():
     """Sample as few directions as among surfaces."""
-    return mock.patch.object(solver, "samples_in_isolated_media", lambda *_: FEW_SAMPLES)
+    return mock.patch.object(solver, "samples_in_isolated_media", lambda *_: (FEW_SAMPLES, True))
 
 
 def cells(body: dict, environment: dict) -> list[str]:

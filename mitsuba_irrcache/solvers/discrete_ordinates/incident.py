@@ -45,9 +45,13 @@ PAIRS_PER_SUN_TRACKS = 8
 FEW_SAMPLES, SEVERAL_SAMPLES, MANY_SAMPLES = 0.5, 2.0, 4.0
 
 
-def samples_in_isolated_media(max_depth: int, is_isotropic: bool) -> float:
-    """Return the number of directions per pair of ordinates that are sampled for isolated media."""
-    return SEVERAL_SAMPLES if max_depth == 2 or not is_isotropic else MANY_SAMPLES
+def samples_in_isolated_media(max_depth: int, is_isotropic: bool) -> tuple[float, bool]:
+    """Return the number of directions per pair of ordinates that are sampled for isolated media,
+    and whether only maps with bright regions are sampled: in other maps, moments are less noisy
+    with even ordinates alone.
+    """
+    samples = SEVERAL_SAMPLES if max_depth == 2 or not is_isotropic else MANY_SAMPLES
+    return samples, not is_isotropic
 
 
 class DistantIllumination:
@@ -62,14 +66,15 @@ class DistantIllumination:
         scene: mi.Scene,
         has_other_sources: bool = False,
         samples: float = FEW_SAMPLES,
+        only_bright: bool = True,
     ) -> None:
         """``has_other_sources`` states that the medium emits, possibly with another colour.
         ``samples`` is the number of directions that are sampled from an environment map, per pair
-        of ordinates.
+        of ordinates; with ``only_bright``, maps without bright regions are not sampled.
         """
         self._has_other_sources = has_other_sources
         self._environment = scene.environment()
-        self._samples_per_pair = samples if self._is_sampled(samples) else 0.0
+        self._samples_per_pair = samples if self._is_sampled(only_bright) else 0.0
         self._bright_regions: tuple | None = None
         self._suns, self.point_lights = [], []
         for emitter in scene.emitters():
@@ -139,12 +144,12 @@ class DistantIllumination:
             for e in self.point_lights
         ]
 
-    def _is_sampled(self, samples: float) -> bool:
-        """Return whether this number of samples per pair reduces the error of even ordinates."""
+    def _is_sampled(self, only_bright: bool) -> bool:
+        """Return whether directions are sampled from the environment."""
         environment = self._environment
         if environment is None or kind_of(environment) is EmitterKind.CONSTANT_ENVIRONMENT:
             return False
-        return exceeds_even_ordinates(environment) if samples > 1 else not is_smooth(environment)
+        return not is_smooth(environment) if only_bright else exceeds_even_ordinates(environment)
 
     def _even_irradiance(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the irradiance (n, 2, channels) of an environment along even ordinates, 0 without

@@ -116,10 +116,10 @@ class Sweep:
     ) -> None:
         """``rr_depth`` applies to paths between surfaces; ``pause`` is called after each launch."""
         self.cache, self.seed = cache, seed
-        samples = FEW_SAMPLES
+        sampling = FEW_SAMPLES, True
         if medium.is_isolated:
-            samples = samples_in_isolated_media(cache.max_depth, not cache.moments)
-        self._illumination = DistantIllumination(scene, medium.emission is not None, samples)
+            sampling = samples_in_isolated_media(cache.max_depth, not cache.moments)
+        self._illumination = DistantIllumination(scene, medium.emission is not None, *sampling)
         if not cache.active_count:
             return
         self._medium = medium

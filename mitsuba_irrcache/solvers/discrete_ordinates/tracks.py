@@ -372,6 +372,7 @@ def values_at_centres(
             side = dr.opaque(mi.UInt32, grid.resolution[k])
             in_layers = (at < layers) | (at + layers >= side)
             if k == axis:
+                is_lit &= here > 0
                 mean = _mean_over_value(second / dr.select(is_lit, here, 1))
                 factor = dr.select(in_layers & is_lit, mean, 1)
                 continue
