@@ -88,11 +88,11 @@ class FittedBorder(Immutable):
         grid, channels, result = self.border.grid, self.channels, self.roots
         index = dr.arange(mi.UInt32, grid.voxel_count * channels)
         voxel = index // channels
+        own_known = dr.gather(mi.Bool, self.known, voxel)
         sides = zip(grid.voxel_indices(voxel), grid.sides, strict=True)
         for axis, (place, side) in enumerate(sides):
             last = mi.UInt32(side) - 1
-            at_face = dr.gather(mi.Bool, self.known, voxel)
-            at_face &= (last > 0) & ((place == 0) | (place == last))
+            at_face = own_known & (last > 0) & ((place == 0) | (place == last))
             profile = _Profile(self, axis, voxel, index - voxel * channels, at_face)
             ratio = dr.select(self.roots > 0, profile.centre() / dr.maximum(self.roots, 1e-15), 1)
             result = dr.select(at_face, result * dr.lerp(1, ratio, profile.weight), result)

@@ -348,7 +348,11 @@ def border_error(medium: MediumGrid, grid: Grid, max_depth: int = -1) -> float:
     """Estimate the error [%] of pixels at the boundary of a medium that is dense there, due to
     interpolation between the voxels of ``grid``.
     """
-    depth = border_depth(medium, grid)
+    return _error_at_boundary(border_depth(medium, grid), medium, max_depth)
+
+
+def _error_at_boundary(depth: float, medium: MediumGrid, max_depth: int) -> float:
+    """Return `border_error` for an optical ``depth`` of a voxel at the boundary."""
     error = _error_of_edge(depth, medium)
     if not medium.fills(Grid((1, 1, 1), medium.frame)):
         absorbed = 1.0 if max_depth == 2 else 1 - _border_albedo(medium)
@@ -363,7 +367,7 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid, max_depth: int = -1) ->
     Irradiance decays within a fraction of a mean free path there, and no voxel lies beyond.
     """
     depth = border_depth(medium, grid)
-    error = border_error(medium, grid, max_depth)
+    error = _error_at_boundary(depth, medium, max_depth)
     if error > LARGE_BORDER_ERROR:
         mi.Log(
             mi.LogLevel.Warn,

@@ -82,18 +82,27 @@ def rendered(depth: float, albedo: float, max_depth: int, mu: float) -> float:
 
 
 def face(
-    integrator: dict, body: dict, mu: float, spp: int, environment: dict | None = None
+    integrator: dict,
+    body: dict,
+    mu: float,
+    spp: int,
+    environment: dict | None = None,
+    half: float = 1.0,
+    shift: float = 0.0,
 ) -> np.ndarray:
     """Return an image of the middle of a face of a cube, seen at a cosine, in an ``environment``
     (None: uniform radiance).
+
+    ``half`` is half an edge of the cube, ``shift`` the coordinate x of its centre.
     """
-    origin = [4 * float(np.sqrt(1 - mu * mu)), 0, -1 - 4 * mu]
-    camera = mi.ScalarTransform4f().look_at(origin, [0, 0, -1], [0, 1, 0]).scale(0.4)
+    middle = np.array([shift, 0.0, -half])
+    origin = middle + 4 * half * np.array([np.sqrt(1 - mu * mu), 0, -mu])
+    camera = mi.ScalarTransform4f().look_at(list(origin), list(middle), [0, 1, 0])
     film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}}
     scene = mi.load_dict({
         "type": "scene",
         "integrator": integrator | {"hide_emitters": True},
-        "sensor": {"type": "orthographic", "to_world": camera, "film": film},
+        "sensor": {"type": "orthographic", "to_world": camera.scale(0.4 * half), "film": film},
         "environment": environment or UNIFORM,
         "cube": body,
     })  # fmt: skip

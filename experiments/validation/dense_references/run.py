@@ -17,10 +17,10 @@ import numpy as np
 import mitsuba_irrcache  # noqa: F401 (registers the plugin)
 from experiments.support.documents import replace_tables
 from experiments.support.options import add_document, begin, parser_of
-from experiments.validation.dense_faces.run import COSINES, radiance, scattering
+from experiments.validation.dense_faces.run import COSINES, face, radiance, scattering
 from mitsuba_irrcache.compare.tables import Table
 
-PIXELS, SPP, STOCK_SPP = 16, 256, 16384
+SPP, STOCK_SPP = 256, 16384
 #: Albedo, and ``max_depth`` of the rows; optical depths of half an edge.
 ALBEDO, ORDERS, DEPTHS = 0.8, (2, -1), (25.0, 50.0, 100.0)
 #: Half an edge of the cube, and the coordinate x of its centre.
@@ -29,39 +29,26 @@ HEAD = ["scattering", "cosine", *(f"{d:g} mean free paths in half an edge" for d
 PLACE_HEAD = ["half an edge", "x of the centre", "volpath", "irrcache"]
 
 
-def face(
-    integrator: dict, depth: float, mu: float, spp: int, half: float = 1.0, shift: float = 0.0
-) -> np.ndarray:
-    """Return an image of the middle of a face of a cube in uniform radiance.
-
-    ``depth`` is the optical depth of ``half`` an edge, ``mu`` the cosine to the normal.
+def cube(depth: float, half: float, shift: float) -> dict:
+    """Return a homogeneous cube with this optical ``depth`` of ``half`` an edge, whose centre has
+    the coordinate x ``shift``.
     """
-    middle = np.array([shift, 0.0, -half])
-    origin = middle + 4 * half * np.array([np.sqrt(1 - mu * mu), 0, -mu])
-    camera = mi.ScalarTransform4f().look_at(list(origin), list(middle), [0, 1, 0])
-    film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}}
     medium = {"type": "homogeneous", "sigma_t": depth / half, "albedo": ALBEDO}
     place = mi.ScalarTransform4f().translate([shift, 0, 0]).scale(half)
-    scene = mi.load_dict({
-        "type": "scene",
-        "integrator": integrator | {"hide_emitters": True},
-        "sensor": {"type": "orthographic", "to_world": camera.scale(0.4 * half), "film": film},
-        "environment": {"type": "constant", "radiance": 1.0},
-        "cube": {
-            "type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": medium,
-        },
-    })  # fmt: skip
-    return np.array(mi.render(scene, spp=spp), np.float64)
+    return {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": medium}
 
 
-def differences(max_depth: int, depth: float, mu: float, *place: float) -> list[str]:
+def differences(
+    max_depth: int, depth: float, mu: float, half: float = 1.0, shift: float = 0.0
+) -> list[str]:
     """Return the differences of volpath, with its standard error, and of irrcache [%]."""
     expected, cells = radiance(ALBEDO, max_depth, mu), []
     for name, spp in (("volpath", STOCK_SPP), ("irrcache", SPP)):
-        image = face({"type": name, "max_depth": max_depth}, depth, mu, spp, *place)
+        integrator, body = {"type": name, "max_depth": max_depth}, cube(depth, half, shift)
+        image = face(integrator, body, mu, spp, half=half, shift=shift)
         cells.append(f"{100 * (image.mean() / expected - 1):+.2f}")
         if name == "volpath":
-            cells[-1] += f" ± {100 * image.std() / PIXELS / expected:.2f}"
+            cells[-1] += f" ± {100 * image.std() / np.sqrt(image.size) / expected:.2f}"
     return cells
 
 
