@@ -77,16 +77,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - resolution
        - |int|
-       - Cache voxels along the longest side of the medium, near-cubic whatever its data;
-         0: chosen for an estimated error of 0.5 % of the mean radiance (``path``: 1 %): the
-         resolution of the data, up to eight times as many voxels along each axis if they are
-         optically thick (ten if opaque), at least 32 along the longest side (48 around emitters,
-         ``path``: 16), up to 64 or 128 if the contrast is high or the boundary cuts through dense
-         regions; fewer in smooth data under environments without bright regions; at most 2^25 in
-         total (2^24 if finer than data that are not opaque, 2^21 with anisotropic scattering), for
-         ``path`` 128 along a side, and 32 to 64 with surfaces or several media. An opaque
-         homogeneous medium in a box or sphere has no cache: its radiance is that of a half-space.
-         (Default: 0)
+       - Cache voxels along the longest side of the medium, near-cubic whatever its data. 0: chosen
+         for an estimated error of 0.5 % of the mean radiance (``path``: 1 %) from the data, their
+         optical depth and the emitters, at least 32 (``path``: 16) and at most 2^25 voxels in total
+         (2^21 with anisotropic scattering; ``path``: 128 along a side, 32 to 64 with surfaces or
+         several media). The log states the rule that decided; the how-to page lists all. An opaque
+         homogeneous medium in a box or sphere has no cache unless this is set: its radiance is that
+         of a half-space. (Default: 0)
 
      * - tolerance
        - |float|
@@ -105,12 +102,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - cache_spp
        - |int|
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
-         of 8 samples or 32 to 256 directions. These are directions of scattering: the pass that
-         solves, suns, samples of an environment and entry from surfaces come on top;
-         0: 128 directions, 64 with surfaces unless emitters are in the medium (256 for sharp phase
-         functions), twice as many for single scattering with an isotropic phase function, 64 for
-         more orders of it in uniform light; 16 to 256 samples, about 2^24 for all voxels, 2^22 with
-         surfaces. (Default: 0)
+         of 8 samples or 32 to 256 directions. Not counted are the directions with which all orders
+         are solved for, those of ``directional`` emitters, those sampled from an ``envmap``, and
+         those along which surfaces illuminate the medium. 0: 128 directions; 64 with surfaces
+         unless emitters are in the medium (256 for forward peaks); twice as many for single
+         isotropic scattering; 64 for all orders of it under constant environments; ``path``: 16 to
+         256 samples, about 2^24 for all voxels, 2^22 with surfaces, 2^23 behind glass.
+         (Default: 0)
 
      * - cache_seed
        - |int|
@@ -195,6 +193,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - |float|
        - Seconds after which no further batch of the cache and no further pass of camera samples is
          started; the image then consists of the completed ones. (Default: -1, never)
+
+    On this page a *sun* is a ``directional`` emitter, a *point* a ``point`` or ``spot``, and a
+    *lamp* an area emitter.
 
     Computes the irradiance (fluence rate) inside a medium once, independently of the camera, and
     integrates the radiative transfer equation along camera rays with it. The cache is reused for

@@ -22,7 +22,6 @@ from mitsuba_irrcache.io.display import TONES, Display, linear_colour
 from mitsuba_irrcache.io.images import check_output, write_image
 from mitsuba_irrcache.io.scene_files import (
     check_scene_file,
-    describe_integrator,
     has_cache,
     integrator_of,
     load_scene,
@@ -140,9 +139,11 @@ def run(args: argparse.Namespace) -> int:
     with _stopwatch(seconds, "load"), display.stage(f"loading {source.name}"):
         parameters = parse_parameters(args.define)
         integrator = chosen_integrator(source, parameters, args.integrator)
+        properties = {}
         if args.tolerance:
-            integrator = _with_tolerance(integrator, source, parameters, args)
-        scene = load_scene(source, parameters, integrator)
+            _check_tolerance(integrator or integrator_of(source, parameters), args)
+            properties["tolerance"] = args.tolerance
+        scene = load_scene(source, parameters, integrator, properties)
     if not 0 <= args.sensor < len(scene.sensors()):
         raise IrrcacheError(
             f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), "
@@ -160,24 +161,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _with_tolerance(
-    integrator: str | None, source: Path, parameters: dict[str, str], args: argparse.Namespace
-) -> str:
-    """Return the specification of the integrator with the property ``tolerance``."""
+def _check_tolerance(integrator: str, args: argparse.Namespace) -> None:
+    """Refuse a tolerance together with other targets, or for other integrators."""
     if args.budget or args.error:
         raise IrrcacheError(
             "--tolerance is itself a target; leave --budget and --error away, or limit the time by "
             "the property timeout."
         )
-    if integrator is None and integrator_of(source, parameters) == "irrcache":
-        raise IrrcacheError(
-            f'the scene "{source}" sets the properties of irrcache itself; set tolerance there, or '
-            "add -i irrcache to replace them."
-        )
-    name, properties = parse_integrator(integrator or integrator_of(source, parameters))
+    name, _ = parse_integrator(integrator)
     if name != "irrcache":
         raise IrrcacheError(f'--tolerance is a property of irrcache; "{name}" has none.')
-    return describe_integrator(name, properties | {"tolerance": args.tolerance})
 
 
 def _uses_cache(scene: mi.Scene, args: argparse.Namespace) -> bool:

@@ -28,19 +28,23 @@ def load_scene(
     path: str | Path,
     parameters: dict[str, str] | None = None,
     integrator: str | None = None,
+    properties: dict[str, object] | None = None,
 ) -> mi.Scene:
     """Load a scene XML with ``$parameters``, optionally replacing its integrator.
 
     ``integrator`` is a specification such as ``irrcache{step=0.5}``. The `SHARED_PROPERTIES` of the
     scene's own integrator are preserved unless the specification sets them or the new plugin does
-    not support them. Raises IrrcacheError if the file is missing or has no integrator to replace.
+    not support them. ``properties`` are set in addition to those that the integrator has. Raises
+    IrrcacheError if the file is missing.
     """
     path = Path(path)
     config, state = _parse(path, parameters)
     with _explained(path), _search_path(path.parent):
         mi.parser.transform_all(config, state)
         if integrator is not None:
-            _replace_integrator(state, integrator, path)
+            _replace_integrator(state, integrator)
+        for key, value in (properties or {}).items():
+            _integrator_node(state).props[key] = value
         scene = mi.parser.instantiate(config, state)
     return scene[0] if isinstance(scene, list) else scene
 
@@ -168,7 +172,7 @@ def loses_emission(path: str | Path, parameters: dict[str, str] | None, integrat
     node = _integrator_node(state)
     if node is None or "emission" not in node.props or node.props.get("emission_scale", 1.0) == 0:
         return False
-    _replace_integrator(state, integrator, Path(path))
+    _replace_integrator(state, integrator)
     return "emission" not in node.props
 
 
@@ -261,11 +265,19 @@ def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None
     return next((n for n in state.nodes if n.type == mi.ObjectType.Integrator), None)
 
 
-def _replace_integrator(state: mi.parser.ParserState, specification: str, path: Path) -> None:
+def _add_integrator(state: mi.parser.ParserState) -> mi.parser.SceneNode:
+    """Add a node for the integrator of a scene that names none."""
+    node = mi.parser.SceneNode()
+    node.type = mi.ObjectType.Integrator
+    state.nodes.append(node)
+    number = len(state.nodes) - 1
+    state.root.props["integrator"] = mi.Properties.ResolvedReference(number)
+    return state.nodes[number]
+
+
+def _replace_integrator(state: mi.parser.ParserState, specification: str) -> None:
     name, properties = parse_integrator(specification)
-    node = _integrator_node(state)
-    if node is None:
-        raise IrrcacheError(f'"{path}" names no integrator; add <integrator type="{name}"/> to it.')
+    node = _integrator_node(state) or _add_integrator(state)
     inherited = {k: node.props[k] for k in SHARED_PROPERTIES if k in node.props}
     for key in list(node.props.keys()):
         del node.props[key]

@@ -216,6 +216,12 @@ def test_command(rgb, scenes, tmp_path, capsys):
     assert "tolerance 5 %" in capsys.readouterr().out
     header = OpenImageIO.ImageInput.open(str(tmp_path / "scene.exr")).spec()
     assert "% of the mean radiance" in header.getattribute("irrcache:error")
+    text = source.read_text().replace(
+        '"volpath">', '"irrcache"> <integer name="cache_spp" value="64"/>'
+    )
+    source.write_text(text)
+    assert main(["render", str(source), "--tolerance", "5%", "-v"]) == 0
+    assert "tolerance 5 %" in capsys.readouterr().out
     assert main(["render", str(source), "--tolerance", "5%", "--budget", "3"]) == 1
     assert "leave --budget and --error away" in capsys.readouterr().err
     with pytest.raises(SystemExit):

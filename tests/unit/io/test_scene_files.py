@@ -132,9 +132,20 @@ def test_integrator_of(file):
     assert integrator_of(file) == "volpath"
 
 
-def test_missing_file_and_missing_integrator(tmp_path):
+def test_missing_file(tmp_path):
     with pytest.raises(IrrcacheError, match=r"no scene file .*absent\.xml"):
         load_scene(tmp_path / "absent.xml")
-    (tmp_path / "bare.xml").write_text('<scene version="3.0.0"/>')
-    with pytest.raises(IrrcacheError, match="names no integrator"):
-        load_scene(tmp_path / "bare.xml", integrator="irrcache")
+
+
+def test_integrator_is_added_to_a_scene_that_names_none(tmp_path):
+    file = tmp_path / "bare.xml"
+    file.write_text('<scene version="3.0.0"> <sensor type="perspective"/> </scene>')
+    scene = load_scene(file, integrator="irrcache{max_depth=3}")
+    assert "max_depth = 3" in str(scene.integrator())
+    assert len(scene.sensors()) == 1
+
+
+def test_properties_are_added_to_those_of_the_integrator(file):
+    scene = load_scene(file, integrator="irrcache{step=0.5}", properties={"tolerance": 0.25})
+    text = str(scene.integrator())
+    assert "step = 0.5" in text and "tolerance = 0.25" in text and "max_depth = 3" in text
