@@ -35,6 +35,8 @@ COSINE = 0.6
 #: Relative range of the decay per voxel, below that of E_2, over which the exponential gradually
 #: takes the place of E_2, and its minimum.
 BLENDED, STEEPEST = 0.25, 0.02
+#: Fewest voxels along an axis between whose faces the profile is used.
+FEWEST = 4
 #: Numbers of entries of the tables, over the optical depth and over the albedo.
 DEPTHS, ALBEDOS = 128, 128
 #: Columns of the table over the optical depth: the means of E_2 over the three outermost voxels and
@@ -57,45 +59,57 @@ class BorderProfile(Immutable):
         single: whether radiance is scattered once only, so that the irradiance is uncollided.
         depth: optical depth of a voxel at the boundary.
 
-    Values are means over voxels without noise, as those of the solver ``sweep``.
+    Values are means over voxels without noise, as those of the solver ``sweep``. In a medium whose
+    boundary cuts voxels, such as a sphere, it has no effect.
     """
 
     def __init__(self, medium: MediumGrid, grid: Grid, single: bool, depth: float) -> None:
         self.medium, self.grid, self.single, self.depth = medium, grid, single, depth
-
-    def fitted(self, roots: mi.Float, known: mi.Bool, channels: int) -> FittedBorder:
-        """Fit the profile to the square ``roots`` of the means over voxels.
-
-        ``known`` are the voxels that have values.
-        """
-        return FittedBorder(self, roots, known, channels)
+        #: whether the boundary is that of the grid
+        self.is_at_faces = medium.fills(grid)
 
 
 class FittedBorder(Immutable):
-    """The profile at the faces of a grid for given values, see `BorderProfile.fitted`."""
+    """The profile at the faces of a grid, fitted to the square ``roots`` of means over voxels.
+
+    ``known`` are the voxels that have values; ``separated`` are those that a surface separates from
+    the next voxel along each axis, beyond which no values are read.
+    """
 
     def __init__(
-        self, border: BorderProfile, roots: mi.Float, known: mi.Bool, channels: int
+        self,
+        border: BorderProfile,
+        roots: mi.Float,
+        known: mi.Bool,
+        channels: int,
+        separated: tuple[mi.Bool, mi.Bool, mi.Bool] | None = None,
     ) -> None:
         self.border, self.roots, self.known, self.channels = border, roots, known, channels
+        self.separated = separated
 
     def at_centres(self) -> mi.Float:
-        """Return the roots, those of the outermost voxels at their centres.
+        """Return the ``roots`` with those of the outermost voxels replaced by roots at their
+        centres.
 
         Linear interpolation between these and the next ones has the weighted mean of the profile
         over the inner half of the outermost voxels.
         """
-        grid, channels, result = self.border.grid, self.channels, self.roots
-        index = dr.arange(mi.UInt32, grid.voxel_count * channels)
-        voxel = index // channels
-        own_known = dr.gather(mi.Bool, self.known, voxel)
+        grid, channels, result = self.border.grid, self.channels, dr.copy(self.roots)
+        voxel = dr.arange(mi.UInt32, grid.voxel_count)
         sides = zip(grid.voxel_indices(voxel), grid.sides, strict=True)
         for axis, (place, side) in enumerate(sides):
             last = mi.UInt32(side) - 1
-            at_face = own_known & (last > 0) & ((place == 0) | (place == last))
-            profile = _Profile(self, axis, voxel, index - voxel * channels, at_face)
-            ratio = dr.select(self.roots > 0, profile.centre() / dr.maximum(self.roots, 1e-15), 1)
-            result = dr.select(at_face, result * dr.lerp(1, ratio, profile.weight), result)
+            at_face = dr.compress(self.known & (last > 0) & ((place == 0) | (place == last)))
+            if not dr.width(at_face):
+                continue
+            number = dr.arange(mi.UInt32, dr.width(at_face) * channels)
+            own = dr.gather(mi.UInt32, at_face, number // channels)
+            channel = number - number // channels * channels
+            profile = _Profile(self, axis, own, channel, mi.Bool(True))
+            index = own * channels + channel
+            root = dr.gather(mi.Float, result, index)
+            ratio = dr.select(root > 0, profile.centre() / dr.maximum(root, 1e-15), 1)
+            dr.scatter(result, root * dr.lerp(1, ratio, profile.weight), index)
         dr.eval(result)
         return result
 
@@ -132,7 +146,7 @@ class _Profile:
         # Anisotropic scattering decays like isotropic scattering of the reduced extinction.
         reduced = 1 - albedo * dr.opaque(mi.Float, float(medium.phase.moments[1]))
         albedo = dr.clip(1 - (1 - albedo) / dr.maximum(reduced, 1e-3), 0, 1)
-        depth = extinction * dr.opaque(mi.Float, float(grid.voxel_size[axis]))
+        depth = extinction * dr.opaque(mi.Float, float(grid.voxel_thickness[axis]))
 
         # Read the three outermost values.
         place, side = grid.voxel_indices(voxel)[axis], grid.sides[axis]
@@ -143,6 +157,9 @@ class _Profile:
             at = mi.UInt32(mi.Int32(voxel) + k * step)
             is_known = is_known & (mi.UInt32(side) > k)
             is_known &= dr.gather(mi.Bool, fitted.known, at, is_known)
+            if fitted.separated is not None and k:
+                lower = dr.minimum(at, mi.UInt32(mi.Int32(at) - step))
+                is_known &= ~dr.gather(mi.Bool, fitted.separated[axis], lower, is_known)
             roots.append(
                 dr.gather(mi.Float, fitted.roots, at * fitted.channels + channel, is_known)
             )
@@ -153,11 +170,18 @@ class _Profile:
 
         #: share of this profile in the result
         self.weight = dr.clip((depth - THIN) * (1 / (RESOLVED - THIN)), 0, 1)
-        is_plain = has_inner & _is_plain_face(medium, grid, axis, voxel)
-        self.weight = dr.select(is_plain, self.weight, 0)
+        # In a thin plate radiance that enters on the other side is not small.
+        is_used = has_inner & (mi.UInt32(side) >= FEWEST) & _is_apart_from_edges(grid, axis, voxel)
+        self.weight = dr.select(is_used, self.weight, 0)
+        depth = dr.clip(depth, THIN, OPAQUE)
+        if border.single:
+            # No radiance that enters here decays less than perpendicular one: more of the second
+            # value has entered through other faces.
+            slowest = dr.exp(-depth)
+            ratio = second / dr.maximum(first, 1e-30)
+            self.weight *= dr.clip((1 - ratio) / (1 - slowest), 0, 1)
 
         # Fit A and B, with E_2 and with the exponential in its place.
-        depth = dr.clip(depth, THIN, OPAQUE)
         self._table = table = _Table(depth)
         decay, slope = _decay(albedo) * reduced, 1 / COSINE
         slow = _Exponential(decay, depth, slope)
@@ -239,18 +263,15 @@ def _end(
     return dr.select(total > 0, rest / dr.maximum(total, 1e-30), 0)
 
 
-def _is_plain_face(medium: MediumGrid, grid: Grid, axis: int, voxel: mi.UInt32) -> mi.Bool:
-    """Return whether the medium fills a voxel at a face normal to an ``axis`` up to the face, and
-    no other face is next to the voxel, whose profile would add up with that of this one.
+def _is_apart_from_edges(grid: Grid, axis: int, voxel: mi.UInt32) -> mi.Bool:
+    """Return whether a voxel at a face normal to an ``axis`` is at no other face, whose profile
+    would add up with that of this one.
     """
     places, at_edge = grid.voxel_indices(voxel), mi.Bool(False)
     for other, (place, side) in enumerate(zip(places, grid.sides, strict=True)):
         if other != axis:
             at_edge |= (place == 0) | (place + 1 == mi.UInt32(side))
-    nearly = grid.to_world[:3, axis] * (0.45 / grid.resolution[axis])
-    outwards = mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in nearly))
-    outwards *= dr.select(places[axis] == 0, -1, 1)
-    return medium.contains(grid.centers(voxel) + outwards) & ~at_edge
+    return ~at_edge
 
 
 def _solved(

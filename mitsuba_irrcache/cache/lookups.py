@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular_field import AngularField
-from mitsuba_irrcache.cache.border import BorderProfile
+from mitsuba_irrcache.cache.border import BorderProfile, FittedBorder
 from mitsuba_irrcache.cache.conservative import conserving, share_of_noise
 from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.statistics import BatchSums, root_correction
@@ -60,8 +60,11 @@ def irradiance_field(
 
 
 def border_of(sums: BatchSums, interpolation: Interpolation) -> BorderProfile | None:
-    """Return the profile at the faces of the grid, or None if it would amplify noise of voxels."""
-    return None if sums.has_own_errors else interpolation.border
+    """Return the profile at the faces of the grid, or None if the boundary is elsewhere or the
+    profile would amplify noise of voxels.
+    """
+    border = interpolation.border
+    return None if sums.has_own_errors or border is None or not border.is_at_faces else border
 
 
 def root_field(
@@ -78,11 +81,10 @@ def root_field(
 
     ``share`` is that of `conserving`, ``variance`` the relative variance of noisy values.
     """
-    fitted = None
+    fitted, separated = None, None if classes is None else classes.separated
     if border is not None:
-        fitted = border.fitted(roots, known, channels)
+        fitted = FittedBorder(border, roots, known, channels, separated)
         roots = fitted.at_centres()
-    separated = None if classes is None else classes.separated
     roots = conserving(grid, roots, known, channels, share, separated)
     if classes is not None:
         roots = classes.filled(roots, channels)

@@ -19,10 +19,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.cache.border import FittedBorder
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.grids.root_field import Extension, extrapolated
 
 #: Number of random error fields. With few, a pixel's error bar is itself uncertain: 4 have 63, 88
@@ -95,7 +97,10 @@ def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     inside = extension.inside(voxel)
     beyond = sum(dr.select(i != inside, mi.Float(1), 0) for i in extension.inwards(voxel))
     inner = dr.gather(mi.Float, roots, inside)
-    growth = extrapolated(extension, roots) / dr.select(inner > 0, inner, 1)
+    border = cache.border
+    if border is not None:
+        border = FittedBorder(border, roots, marked(cache.grid, cache.active), 1)
+    growth = extrapolated(extension, roots, border=border) / dr.select(inner > 0, inner, 1)
     # Extrapolated roots are a^2 / b (`extrapolated`); their relative error is sqrt(2^2 + 1) times
     # that of equally noisy a and b.
     deviation = dr.gather(mi.Float, deviations, inside) * growth * 5 ** (0.5 * beyond)

@@ -145,6 +145,7 @@ class MediumAdjoint:
                 self._pairs,
                 single=settings.max_depth == 2,
                 grey=is_grey and not (channels_apart or self._emitters or EMISSION in wanted),
+                has_dense_boundary=self._part.cache.interpolation.border is not None,
             ),
         )
 

@@ -65,7 +65,12 @@ class CoupledMedium:
     ) -> None:
         self.medium, self.wanted, self.step = part.medium, wanted, step
         self.cache, self.grid = part.cache, part.cache.grid
-        settings = TransportSettings((part.settings.seed, seed), PAIRS, single=False)
+        settings = TransportSettings(
+            (part.settings.seed, seed),
+            PAIRS,
+            single=False,
+            has_dense_boundary=self.cache.interpolation.border is not None,
+        )
         self.transport = AdjointTransport(scene, part.medium, self.grid, (), settings)
         found = VoxelQuadrature(part.medium, self.grid).extinction()
         self.channels = self.transport.channels

@@ -30,6 +30,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
     collision_albedo,
     extinction_grid,
     resampled,
+    track_extinction,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
@@ -71,12 +72,14 @@ class TransportSettings:
         single: whether radiance is scattered once only.
         grey: whether the medium and the derivatives have a single channel. If all emitters are of
             one colour, too, a single channel is computed for all.
+        has_dense_boundary: as in `extinction_grid`.
     """
 
     seed: tuple[int, int]
     pairs: int
     single: bool
     grey: bool = False
+    has_dense_boundary: bool = False
 
 
 class AdjointTransport:
@@ -119,13 +122,13 @@ class AdjointTransport:
         self.lights = LightsOfOneDirection(scene, medium, grid, self.scattering, illumination)
         self.lights.add_suns(self.ordinates, self.parts, illumination.sun_pairs(pairs))
         #: the equation of channels that are swept together, and the indices of these channels
-        self.levels = self._new_levels(medium, grid)
+        self.levels = self._new_levels(medium, grid, settings.has_dense_boundary)
 
     def _new_levels(
-        self, medium: MediumGrid, grid: Grid
+        self, medium: MediumGrid, grid: Grid, has_dense_boundary: bool
     ) -> list[tuple[MultigridLevel, tuple[int, ...]]]:
-        detail = extinction_grid(medium, grid)
-        extinction = resampled(medium, medium.sigma_t, detail)
+        detail = extinction_grid(medium, grid, has_dense_boundary)
+        extinction = track_extinction(medium, grid, detail)
         mean = resampled(medium, medium.sigma_t, grid) if detail is not grid else extinction
         plain = resampled(medium, medium.albedo, grid)
         albedo = collision_albedo(medium, grid, dr.arange(mi.UInt32, grid.voxel_count))

@@ -61,6 +61,11 @@ class Grid:
         """World lengths of the edges of a voxel."""
         return self.side_lengths / self.resolution
 
+    @cached_property
+    def voxel_thickness(self) -> np.ndarray:
+        """World distances between opposite faces of a voxel."""
+        return 1 / np.linalg.norm(np.linalg.inv(self.to_world[:3, :3]), axis=1) / self.resolution
+
     def shared(self, *others: Grid | None) -> Grid:
         """Return the first of ``others`` with the same voxels as this grid, else this grid.
 

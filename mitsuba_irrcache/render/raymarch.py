@@ -47,6 +47,8 @@ COARSER, COARSEST = 0.2, 0.03
 #: Optical depth of a step above which it is divided where the medium is dense at its boundary, into
 #: at most MOST_SUBSTEPS: the irradiance there decays within a fraction of a mean free path.
 SUBSTEP_DEPTH, MOST_SUBSTEPS = 0.15, 8
+#: Multiple of the offset of a ray whose fraction is another random number.
+FRACTION = 1024.0
 #: Maximum optical depth per step of the packed extinction: the 16-bit format has a limited range,
 #: which larger values would waste.
 OPAQUE = 4096.0
@@ -639,6 +641,10 @@ class _RayMarch:
                 depth = dr.maximum(extinction * self._projection.step, 1e-6)
                 count = dr.floor(SUBSTEP_DEPTH * dr.rcp(depth))
                 stride *= dr.clip(count, 1, self._projection.substeps)
+                # The random offset covers a short step only: vary the first one among all lengths.
+                first = self._lattice[2] * FRACTION
+                first = dr.floor((first - dr.floor(first)) * stride) + 1
+                stride = dr.select(state.k == 0, first, stride)
             state.stride = stride
 
 

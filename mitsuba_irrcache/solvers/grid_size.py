@@ -61,7 +61,7 @@ LARGE_OPAQUE_ERROR, MOST_OPAQUE_ERROR = 4.5, 9.0
 #: axis of it, and MOST_IN_OPAQUE_DATA in all. Bone of depth 100 per voxel of 32^3 has an RMSE of
 #: 0.94 % then, and of 1.15 % with MOST_PER_DATA_VOXEL (experiments/validation/thick).
 VERY_OPAQUE, MOST_PER_OPAQUE_VOXEL, MOST_IN_OPAQUE_DATA = 60.0, 10.0, 1 << 25
-#: Maximum number of voxels along the longest side that a boundary of glass can require. Glass
+#: Maximum number of voxels along each axis that a boundary of glass can require. Glass
 #: reflects most of the radiance inside, which then varies less towards the boundary, and voxels are
 #: more expensive. At an optical depth of 40 this number has an error of 0.5 % (ball) and 0.7 %
 #: (cube).
@@ -111,9 +111,9 @@ class SizeRule:
     Attributes:
         target_error: RMSE of the image that the grid aims at [%].
         fewest: minimum number of voxels along the longest side.
-        most_by_contrast: maximum number along the longest side that contrast inside of the medium
-            can require; ``most_by_border`` is the same for media that are dense at their boundary
-            or homogeneous.
+        most_by_contrast: maximum number along each axis that contrast inside of the medium can
+            require; ``most_by_border`` is the same for media that are dense at their boundary or
+            homogeneous.
         refines_dense_data: whether voxels may be smaller than those of dense data.
         most: maximum number of voxels along the longest side.
         larger_in_smooth_light: whether voxels may be larger than those of smooth data if all
@@ -212,8 +212,8 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
         (per_path, mean, rule.most_by_contrast),
         (at_boundary, border, most_by_border),
     ):
-        counts = extinction * lengths / edge
-        wanted[reason] = counts * min(1, most / max(counts.max(), 1))
+        # Limit each axis by itself: a thin plate is resolved across.
+        wanted[reason] = np.minimum(extinction * lengths / edge, most)
     sides = np.max(list(wanted.values()), axis=0)
     reason = max(wanted, key=lambda key: wanted[key].max())
     limit = voxels
@@ -414,8 +414,8 @@ def warn_of_unresolved_detail(medium: MediumGrid, grid: Grid) -> None:
 
 
 def border_depth(medium: MediumGrid, grid: Grid) -> float:
-    """Return the optical depth of the longest edge of a voxel at the boundary of a medium."""
-    return _border_extinction(medium) * grid.voxel_size.max()
+    """Return the largest optical depth of a voxel between opposite faces, at the boundary."""
+    return _border_extinction(medium) * grid.voxel_thickness.max()
 
 
 def _border_extinction(medium: MediumGrid) -> float:

@@ -133,7 +133,7 @@ MUTANTS = (
     Mutant(
         "values at centres taken as means at dense faces",
         "solvers/discrete_ordinates/tracks.py",
-        "layers = LAYERS if self.has_dense_faces else 0",
+        "self.layers = LAYERS if has_dense_faces else 0",
         "layers = 0",
         ("tests/correctness/test_dense_border.py",),
     ),

@@ -78,8 +78,8 @@ class Moments:
         offsets: np.ndarray,
         boundary_source: Callable | None = None,
     ) -> mi.Float:
-        """Return the moments, at the centres of the active voxels, of the radiance whose irradiance
-        `Tracks.uncollided` computes.
+        """Return the moments of the radiance whose irradiance `Tracks.uncollided` computes, at the
+        same positions.
         """
         none = np.zeros(len(incoming))
         table = tracks.table(directions, incoming, none, offsets, by_slice=True)
@@ -91,7 +91,7 @@ class Moments:
         values = dr.gather(mi.UInt32, tracks.active, place), channel, channels
         for axis, group, copies in tracks.sweep_separately(table, channels=channels):
             box = SweptBox(tracks.grid, *ends, axis)
-            sums = _add_uncollided(self, sums, copies, group, box, values)
+            sums = _add_uncollided(self, sums, copies, group, box, values, tracks.layers)
             dr.eval(sums)
         return concatenated(sums)
 
@@ -295,17 +295,19 @@ def _add_uncollided(
     group: PairGroup,
     box: SweptBox,
     values: tuple[mi.UInt32, mi.UInt32, int],
+    layers: int,
 ):
     """Add the moments of the irradiance that a sweep of a group has written to ``copies``.
 
-    ``values`` are the voxel and the channel of each of the ``sums``, and the number of channels.
+    ``values`` are the voxel and the channel of each of the ``sums``, and the number of channels;
+    ``layers`` is that of `values_at_centres`.
     """
     voxels, (voxel, channel, channels) = dr.opaque(mi.UInt32, box.grid.voxel_count), values
     k, begin = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(k < group.count, label="uncollided pairs"):
         where = copies, box, voxel, channel, channels
-        forward = values_at_centres(*where, begin=begin)
-        backward = values_at_centres(*where, begin=begin + voxels)
+        forward = values_at_centres(*where, begin=begin, layers=layers)
+        backward = values_at_centres(*where, begin=begin + voxels, layers=layers)
         basis = moments.basis(-group.direction(k))
         sums = _add_pair(moments, sums, basis, forward, backward)
         k += 1

@@ -72,6 +72,12 @@ def resampled(
     return values
 
 
+def track_extinction(medium: MediumGrid, grid: Grid, detail: Grid) -> list[mi.Float]:
+    """Return the channels of the extinction on the grid ``detail``, see `extinction_grid`."""
+    points = FINEST // DETAIL if detail.voxel_count > grid.voxel_count else FINEST
+    return resampled(medium, medium.sigma_t, detail, points)
+
+
 def collision_albedo(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[mi.Float]:
     """Return the channels of the albedo at these ``voxels`` of ``grid``, averaged with the
     extinction as weight: the mean over collisions in uniform radiance.

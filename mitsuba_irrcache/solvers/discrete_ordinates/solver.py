@@ -57,13 +57,12 @@ from mitsuba_irrcache.solvers.discrete_ordinates.refracted_light import (
     refracted_irradiance,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
-    DETAIL,
-    FINEST,
     collision_albedo,
     extinction_grid,
     resampled,
+    track_extinction,
 )
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, means_at_faces
 
 #: Minimum and maximum number of ordinates of a batch (opposite ones count as two). One even set of
 #: 32 has half the noise of two sets of 16, and one of 64 has 0.8 times the noise of two of 32.
@@ -154,10 +153,12 @@ class Sweep:
         self._colour = np.ones(cache.channels)
         self._boundary: SurfaceBoundary | None = None
         self._emitter_sampling: EmitterSampling | None = None
+        #: irradiance from each point-like emitter, among surfaces
+        self._from_points: list[mi.Spectrum] = []
         if medium.is_isolated:
             known = cache.direct_lights
             points = self._illumination.point_irradiance(medium, self._sample_points, known)
-            self._direct = [[irradiance] for irradiance in points]
+            self._direct = [[self._with_means_at_faces(irradiance)] for irradiance in points]
             self._sun_irradiance = [d.irradiance for d in known if d.distant]
         else:
             self._prepare_surroundings(scene, rr_depth)
@@ -187,6 +188,17 @@ class Sweep:
         self._emitter_sampling = EmitterSampling(
             scene, medium, *emitters, self._sample_points, cache.directional
         )
+        points = self._emitter_sampling.from_points
+        self._from_points = [self._with_means_at_faces(irradiance) for irradiance in points]
+
+    def _with_means_at_faces(self, irradiance: mi.Spectrum) -> mi.Spectrum:
+        """Replace values at centres by means where uncollided irradiance along tracks is a mean,
+        except for direct lights, which are subtracted before values are interpolated.
+        """
+        if id(irradiance) in self._closed_form_lights:
+            return irradiance
+        layers = self._tracks[0].layers
+        return means_at_faces(irradiance, self.cache.grid, self.cache.active, layers)
 
     def _prepare_tracks(self, pause: Callable[[], None]) -> None:
         """Create the tracks for each channel of the extinction, and resample extinction and albedo
@@ -196,17 +208,17 @@ class Sweep:
         if medium.refracts:
             # Tracks end at the glass, so the extinction of voxels that it cuts must not be reduced.
             medium = medium.replaced(boundary=Boundary("box", medium.boundary.to_world))
-        is_dense = cache.interpolation.border is not None
+        border = cache.interpolation.border
+        is_dense = border is not None
         detail = extinction_grid(medium, grid, is_dense)
-        points = FINEST // DETAIL if detail.voxel_count > grid.voxel_count else FINEST
-        extinction = resampled(medium, medium.sigma_t, detail, points)
+        extinction = track_extinction(medium, grid, detail)
         box = occupied_box(grid, cache.active)
         # The extinction of blocks of the medium's voxels, or of rotated voxels, may extend beyond
         # the active voxels.
         data = medium.sigma_t.grid
         sparse = data is not None and detail.shape == data.shape and medium.fills(grid)
         # With further orders, the sum of uncollided and scattered irradiance does not depend on it.
-        has_dense_faces = is_dense and cache.max_depth == 2
+        has_dense_faces = is_dense and border.is_at_faces and cache.max_depth == 2
         rest = *box, detail, cache.active, sparse, pause, self._surfaces, has_dense_faces
         self._tracks = [Tracks(grid, sigma_t, *rest) for sigma_t in extinction]
         self._levels: dict[tuple[int, ...], MultigridLevel] = {}
@@ -308,7 +320,7 @@ class Sweep:
         surroundings = self._boundary, self._illumination, self._tracks[0]
         sets, spectra = boundary_ordinate_sets(*surroundings, passes, pairs, rng, seed)
         sampling = self._emitter_sampling
-        direct = [[irradiance] for irradiance in sampling.from_points]
+        direct = [[irradiance] for irradiance in self._from_points]
         if sampling.has_area_emitters:
             direct.append(self._mean_of_two(seed, sampling.from_area_emitters))
         self._direct = self._with_closed_form_lights(direct)

@@ -90,7 +90,9 @@ class Tracks:
         surfaces: SurfaceVoxels | None = None,
         has_dense_faces: bool = False,
     ) -> None:
-        self.surfaces, self.has_dense_faces = surfaces, has_dense_faces
+        self.surfaces = surfaces
+        #: number of layers of voxels at the faces in which uncollided irradiance is a mean
+        self.layers = LAYERS if has_dense_faces else 0
         self.grid, self.extinction_grid = grid, extinction_grid or grid
         self.pause = pause
         self.lower, self.size = np.array(lower), np.array(upper) - np.array(lower)
@@ -171,7 +173,6 @@ class Tracks:
         table = self.table(directions, incoming, np.zeros(len(incoming)), offsets, by_slice=True)
         table.boundary_source = boundary_source(table) if boundary_source is not None else None
         box = self.lower, self.lower + self.size
-        layers = LAYERS if self.has_dense_faces else 0
         channels = (table if table.boundary_source is None else table.boundary_source).channels
         active = self.active_count
         total = dr.opaque(mi.Float, 0, active * channels)
@@ -181,7 +182,7 @@ class Tracks:
             for c in range(channels):
                 where = SweptBox(self.grid, *box, axis), self.active, c, channels
                 cut = None if self.surfaces is None else self.surfaces.is_cut
-                values = values_at_centres(volume, *where, cut=cut, layers=layers)
+                values = values_at_centres(volume, *where, cut=cut, layers=self.layers)
                 index = dr.arange(mi.UInt32, active)
                 index = index + dr.opaque(mi.UInt32, active * c) if c else index
                 # In place: a sum would be a second array.
@@ -380,6 +381,36 @@ def values_at_centres(
         change -= second
     value = dr.maximum(dr.fma(change, dr.opaque(mi.Float, SECOND_DIFFERENCE), value), 0)
     return value * factor if layers else value
+
+
+def means_at_faces(values: mi.Spectrum, grid: Grid, voxels: mi.UInt32, layers: int) -> mi.Spectrum:
+    """Return values at the centres of ``voxels``, replaced by means along the normal of each face
+    of the grid in the outermost ``layers`` of voxels there, see `values_at_centres`.
+    """
+    index, places = voxels, grid.voxel_indices(voxels)
+    if not layers:
+        return values
+    result = []
+    for value in values:
+        volume = dr.zeros(mi.Float, grid.voxel_count)
+        dr.scatter(volume, value, index)
+        factor = mi.Float(1)
+        for at, stride, count in zip(
+            places, strides_of(grid.resolution, (0, 1, 2)), grid.resolution, strict=True
+        ):
+            if count < 3:
+                continue
+            stride, last = (dr.opaque(mi.UInt32, int(n)) for n in (stride, count - 1))
+            centre = index + dr.select(at == 0, stride, 0) - dr.select(at == last, stride, 0)
+            around = centre - stride, centre, centre + stride
+            below, here, above = (dr.gather(mi.Float, volume, i) for i in around)
+            in_layers = (at < layers) | (at + layers > last)
+            in_layers &= (below > 0) & (here > 0) & (above > 0)
+            curvature = (below + above - 2 * here) / dr.select(in_layers, here, 1)
+            factor *= dr.select(in_layers, _mean_over_value(curvature), 1)
+        result.append(value * factor)
+    dr.eval(result)
+    return mi.Spectrum(*result)
 
 
 def _mean_over_value(curvature: mi.Float) -> mi.Float:
