@@ -16,12 +16,10 @@ from mitsuba_irrcache.errors import CacheFileError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.io.files import atomic_write
 
-FORMAT = "mitsuba_irrcache 6"
-
-
-WITH_MOMENTS = "mitsuba_irrcache 7"  # with angular moments of the radiance
-
-
+#: The number changes when files of earlier versions would be read wrongly: before 8, values of
+#: single scattering at dense faces were those at the centres of voxels, not means.
+FORMAT = "mitsuba_irrcache 8"
+WITH_MOMENTS = "mitsuba_irrcache 9"  # with angular moments of the radiance
 ARRAYS = ("active", "totals", "spreads")  # arrays of a file in addition to the description
 
 
