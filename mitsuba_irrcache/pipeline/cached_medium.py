@@ -40,9 +40,9 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask
 from mitsuba_irrcache.solvers.grid_size import (
     SMALL_BORDER_ERROR,
-    border_depth,
-    border_error,
     choose_grid,
+    densest_border_depth,
+    error_at_boundary,
     warn_of_dense_border,
     warn_of_opaque_voxels,
     warn_of_unresolved_detail,
@@ -225,7 +225,8 @@ class CachedMedium:
             if reason is not None:
                 warn_of_sharp_shadows(medium.phase.forward, name, reason)
         samples = -(-samples // 2) if settings.with_error else samples
-        direct_lights = self._direct_lights(scene, grid, active, classes, samples)
+        border_depth = densest_border_depth(medium, grid)
+        direct_lights = self._direct_lights(scene, grid, active, classes, samples, border_depth)
         known = [light.emitter for light in direct_lights]
         falloff = InverseSquareFactor.of(scene, grid, known)
         if known:
@@ -236,9 +237,8 @@ class CachedMedium:
             peak_depths = PeakDepths(medium, grid, active, basis.sources)
         border = None
         # Refracted light is sampled: its noise would be amplified.
-        depth = 0.0 if medium.refracts else border_depth(medium, grid)
-        if depth > THIN:
-            border = BorderProfile(medium, grid, settings.max_depth == 2, depth)
+        if border_depth > THIN and not medium.refracts:
+            border = BorderProfile(medium, grid, settings.max_depth == 2, border_depth)
         interpolation = Interpolation(basis, falloff, direct_lights, classes, peak_depths, border)
 
         def empty(fingerprint: dict[str, str]) -> IrradianceCache:
@@ -308,14 +308,16 @@ class CachedMedium:
         active: mi.UInt32,
         classes: VoxelClasses | None,
         samples: int,
+        border_depth: float,
     ) -> list[DirectLight]:
         """Return the emitters whose irradiance camera rays evaluate in closed form.
 
-        ``samples`` is the number of samples per voxel of the cache.
+        ``samples`` is the number of samples per voxel of the cache, ``border_depth`` the largest
+        optical depth of a voxel at the boundary.
         """
         medium, lights = self.medium, []
         if self.solver.knows_direct_lights(scene, medium, grid, active):
-            dense = border_error(medium, grid) > SMALL_BORDER_ERROR
+            dense = error_at_boundary(border_depth, medium, -1) > SMALL_BORDER_ERROR
             lights = direct_lights_of(scene, medium, grid, active, dense, classes, self._pause)
             lights += area_lights_of(scene, medium, grid, active, classes, samples)
         if medium.refracts:  # radiance of emitters outside reaches voxels only by refraction

@@ -91,6 +91,11 @@ FINER_AROUND_EMITTERS = 1.5
 SIZE_RATIO, LARGEST_SHARE, POSITIONS = 2**0.25, 0.9, 1 << 18
 
 
+#: Numbers of positions at which the extinction on the boundary is sampled: for a percentile, and
+#: for the maximum, which a voxel in a corner of the data may have.
+FEW_POINTS, ALL_POINTS = 1 << 12, 1 << 18
+
+
 @dataclass(frozen=True)
 class SizeAmongSurfaces:
     """Limits of the number of voxels along the longest side of a cache among surfaces.
@@ -348,11 +353,11 @@ def border_error(medium: MediumGrid, grid: Grid, max_depth: int = -1) -> float:
     """Estimate the error [%] of pixels at the boundary of a medium that is dense there, due to
     interpolation between the voxels of ``grid``.
     """
-    return _error_at_boundary(border_depth(medium, grid), medium, max_depth)
+    return error_at_boundary(border_depth(medium, grid), medium, max_depth)
 
 
-def _error_at_boundary(depth: float, medium: MediumGrid, max_depth: int) -> float:
-    """Return `border_error` for an optical ``depth`` of a voxel at the boundary."""
+def error_at_boundary(depth: float, medium: MediumGrid, max_depth: int) -> float:
+    """Estimate `border_error` for an optical ``depth`` of a voxel at the boundary."""
     error = _error_of_edge(depth, medium)
     if not medium.fills(Grid((1, 1, 1), medium.frame)):
         absorbed = 1.0 if max_depth == 2 else 1 - _border_albedo(medium)
@@ -367,7 +372,7 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid, max_depth: int = -1) ->
     Irradiance decays within a fraction of a mean free path there, and no voxel lies beyond.
     """
     depth = border_depth(medium, grid)
-    error = _error_at_boundary(depth, medium, max_depth)
+    error = error_at_boundary(depth, medium, max_depth)
     if error > LARGE_BORDER_ERROR:
         mi.Log(
             mi.LogLevel.Warn,
@@ -418,6 +423,12 @@ def border_depth(medium: MediumGrid, grid: Grid) -> float:
     return _border_extinction(medium) * grid.voxel_thickness.max()
 
 
+def densest_border_depth(medium: MediumGrid, grid: Grid) -> float:
+    """Return `border_depth` for the densest part of the boundary, however small it is."""
+    found = medium.sigma_t.at_world(_on_boundary(medium, ALL_POINTS))
+    return float(dr.max(dr.max(mi.Spectrum(found), axis=0))[0]) * grid.voxel_thickness.max()
+
+
 def _border_extinction(medium: MediumGrid) -> float:
     """Return the 95th percentile of sigma_t on the boundary of the medium, of the densest channel
     [1/scene unit].
@@ -432,10 +443,10 @@ def _border_albedo(medium: MediumGrid) -> float:
     return float(np.quantile(np.array(dr.min(mi.Spectrum(found), axis=0)), 0.05))
 
 
-def _on_boundary(medium: MediumGrid) -> mi.Point3f:
+def _on_boundary(medium: MediumGrid, count: int = FEW_POINTS) -> mi.Point3f:
     """Return random positions on the boundary of the medium."""
-    rng = mi.PCG32(4096)
-    face = dr.arange(mi.UInt32, 4096) % 6
+    rng = mi.PCG32(count)
+    face = dr.arange(mi.UInt32, count) % 6
     place = [rng.next_float32() for _ in range(3)]
     side = mi.Float(face % 2)
     u = mi.Point3f([dr.select(face // 2 == axis, side, p) for axis, p in enumerate(place)])

@@ -109,6 +109,43 @@ def test_thin_plate_with_all_orders(albedo, mu):
     assert thin_plate(1 / 16, 2.0, albedo, mu) == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.parametrize("corner", [True, False])
+def test_dense_voxel_at_the_boundary_of_thin_data(corner):
+    """Single scattering of a sun in one opaque voxel of the data, in a corner or on a face, agrees
+    with that of a fine cache, in means over 4 x 4 pixels that show this voxel only.
+
+    The boundary is dense on a five-hundredth of its area. When the share was required to be a
+    twentieth for the sun to be evaluated along camera rays, mean and largest error were 30 and 185
+    % (corner), and 8 and 61 % (face).
+    """
+    values, images = np.zeros((16, 16, 16, 1), np.float32), []
+    row, column = (0, 15) if corner else (8, 8)
+    values[15, row, column] = 60
+    middle = np.array([(column + 0.5) / 8 - 1, (row + 0.5) / 8 - 1, 15.5 / 8 - 1])
+    to_world = mi.ScalarTransform4f()
+    origin = middle + np.array([1.2, -0.8, 4])
+    look = to_world.look_at(list(origin), list(middle), [0, 1, 0])
+    place, grid = to_world.translate(-1).scale(2), mi.VolumeGrid(values)
+    volume = {"type": "gridvolume", "grid": grid, "to_world": place, "raw": True}
+    medium = {"type": "heterogeneous", "sigma_t": volume, "albedo": 0.9}
+    film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}}
+    for resolution in (0, 256):
+        solver = {"type": "irrcache", "max_depth": 2, "resolution": resolution}
+        scene = {
+            "type": "scene",
+            "integrator": solver | {"hide_emitters": True},
+            "sensor": {"type": "perspective", "fov": 4, "to_world": look, "film": film},
+            "sun": {"type": "directional", "direction": [-0.4, 1, -0.55], "irradiance": 3.0},
+            "cube": {"type": "cube", "bsdf": {"type": "null"}, "interior": medium},
+        }
+        image = np.array(mi.render(mi.load_dict(scene), spp=64), np.float64)[..., 0]
+        images.append(image.reshape(6, 4, 6, 4).mean(axis=(1, 3)))
+    found, expected = images
+    difference = (found - expected) / expected.mean()
+    assert abs(difference.mean()) < 0.02
+    assert abs(difference).max() < 0.1
+
+
 def window(direction: np.ndarray) -> dict:
     """Return an environment map of which only 3 x 3 texels around a direction have radiance."""
     values = np.zeros((128, 256, 1), np.float32)

@@ -119,6 +119,25 @@ def test_other_media_are_refused(scenes, kind, message):
         baked(scenes, other_media(scenes)[kind])
 
 
+@pytest.mark.parametrize("name", ["sigma_t", "albedo"])
+def test_a_dense_voxel_does_not_hide_another_filter(scenes, name):
+    """Volumes with the filter "nearest" are refused if one voxel is hundreds of times as dense as
+    the others.
+
+    When errors were compared with the largest extinction alone, an albedo was accepted, and blocks
+    of pixels were off by 26 %.
+    """
+    box, dense = scenes.placement(), scenes.texture((5, 6, 7), 0, 1, 1)
+    dense[0, 0, 0] = 400
+    fields = {"sigma_t": dense, "albedo": scenes.texture((5, 6, 7), 0, 1, 2)}
+    volumes = {key: scenes.volume(values, box) for key, values in fields.items()}
+    volumes[name] = scenes.volume(fields[name], box, filter_type="nearest")
+    medium = scenes.medium(dense, 0.5, box) | volumes
+    with pytest.raises(UnsupportedSceneError, match="trilinear"):
+        baked(scenes, medium)
+    baked(scenes, scenes.medium(*fields.values(), box))
+
+
 def test_mono_takes_the_luminance(mono, scenes):
     """In a mono variant the luminance of RGB data is used, as in Mitsuba."""
     sigma_t = scenes.texture((3, 3, 3, 3), 0, 2, 4)
