@@ -127,7 +127,7 @@ def test_a_dense_voxel_does_not_hide_another_filter(scenes, name):
     When errors were compared with the largest extinction alone, an albedo was accepted, and blocks
     of pixels were off by 26 %.
     """
-    box, dense = scenes.placement(), scenes.texture((5, 6, 7), 0, 1, 1)
+    box, dense = scenes.placement(), scenes.texture((40, 40, 40), 0, 1, 1)
     dense[0, 0, 0] = 400
     fields = {"sigma_t": dense, "albedo": scenes.texture((5, 6, 7), 0, 1, 2)}
     volumes = {key: scenes.volume(values, box) for key, values in fields.items()}
