@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -201,8 +203,16 @@ class MediumGrid(Immutable):
 
     def fills(self, grid: Grid) -> bool:
         """Return whether the medium fills the whole box covered by ``grid``."""
-        same = np.abs(self.boundary.frame - grid.to_world).max() <= 1e-6 * grid.side_lengths.max()
-        return self.boundary.kind == "box" and self.bbox is None and bool(same)
+        box = self.boundary.frame
+        if self.bbox is not None:
+            box = axis_aligned(*self.bbox)
+            corners = product(*zip(*self.bbox, strict=True))
+            inside = all(self.boundary.contains(np.array(corner)) for corner in corners)
+            is_whole = inside and self.has_exact_boundary
+        else:
+            is_whole = self.boundary.kind == "box"
+        same = np.abs(box - grid.to_world).max() <= 1e-6 * grid.side_lengths.max()
+        return is_whole and bool(same)
 
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Return whether the line of a ray intersects the medium, and its distances of entry and

@@ -413,7 +413,8 @@ def warn_of_unresolved_detail(medium: MediumGrid, grid: Grid) -> None:
         mi.Log(
             mi.LogLevel.Warn,
             "irrcache: the data have dense detail that the voxels of the cache do not resolve: "
-            f"an error of about {error:.1f} % of the mean is expected. Raise resolution "
+            f"an error of about {error:.1f} % of the mean is expected, and several times as much "
+            "in views that show little but this detail. Raise resolution "
             f"(now {max(grid.shape)}), or set tolerance to have it chosen.",
         )
 

@@ -146,6 +146,28 @@ def test_dense_voxel_at_the_boundary_of_thin_data(corner):
     assert abs(difference).max() < 0.1
 
 
+@pytest.mark.parametrize("max_depth", [2, -1])
+@pytest.mark.parametrize("shape", ["cube", "sphere"])
+def test_a_boundary_around_the_data_has_no_effect(shape, max_depth):
+    """Data that end within the boundary of their medium have the same image as in one that ends
+    with them, since Mitsuba clips the medium to them.
+
+    When such voxels counted as cut by the boundary, blocks of a dense cube differed by 16 % of the
+    mean.
+    """
+    body, images = cube(12, 0.9), []
+    sun = {"type": "directional", "direction": [0.1, -1, 0.2], "irradiance": 3.0}
+    around = {
+        "type": shape,
+        "to_world": mi.ScalarTransform4f().scale(1.01 if shape == "cube" else 2),
+    }
+    for boundary in ({}, around):
+        solver = {"type": "irrcache", "resolution": 24, "max_depth": max_depth}
+        image, _ = cube_image(body | boundary, 16, sun, **solver)
+        images.append(image)
+    np.testing.assert_allclose(*images, rtol=1e-3)
+
+
 def window(direction: np.ndarray) -> dict:
     """Return an environment map of which only 3 x 3 texels around a direction have radiance."""
     values = np.zeros((128, 256, 1), np.float32)
