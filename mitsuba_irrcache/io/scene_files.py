@@ -127,7 +127,7 @@ def scene_text(
     path = Path(path)
     _, state = _parse(path, parameters)
     if integrator is not None:
-        _replace_integrator(state, integrator, path)
+        _replace_integrator(state, integrator)
     return ElementTree.tostring(scene_element(state), encoding="unicode")
 
 
@@ -135,7 +135,7 @@ def filled(text: str, integrator: str, parameters: dict[str, str] | None = None)
     """Apply the transformations of `scene_text` to an XML string."""
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_string(config, text, **(parameters or {}))
-    _replace_integrator(state, integrator, Path("scene.xml"))
+    _replace_integrator(state, integrator)
     return ElementTree.tostring(scene_element(state), encoding="unicode")
 
 

@@ -11,6 +11,7 @@ from mitsuba_irrcache.io.scene_files import (
     integrator_of,
     load_scene,
     parse_integrator,
+    scene_text,
     unknown_properties,
 )
 
@@ -142,6 +143,7 @@ def test_integrator_is_added_to_a_scene_that_names_none(tmp_path):
     file.write_text('<scene version="3.0.0"> <sensor type="perspective"/> </scene>')
     scene = load_scene(file, integrator="irrcache{max_depth=3}")
     assert "max_depth = 3" in str(scene.integrator())
+    assert '<integrator type="irrcache"' in scene_text(file, integrator="irrcache{max_depth=3}")
     assert len(scene.sensors()) == 1
 
 
