@@ -184,7 +184,8 @@ def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
         raise volume_error(f"{name}, off by {worst:.1%} of its maximum,")
     # A few dense voxels hide errors elsewhere: compare with the extinction at each point, too, but
     # for single points that rounding puts on the other side of a face.
-    local = dr.maximum(dr.max(mi.Spectrum(sigma_t)), SMALL_EXTINCTION * scale)
+    least = dr.opaque(mi.Float, SMALL_EXTINCTION * scale)
+    local = dr.maximum(dr.max(mi.Spectrum(sigma_t)), least)
     wrong = int(dr.count(error > MOST_LOCAL_ERROR * local)[0])
     if wrong > MOST_WRONG:
         raise volume_error(

@@ -91,9 +91,10 @@ FINER_AROUND_EMITTERS = 1.5
 SIZE_RATIO, LARGEST_SHARE, POSITIONS = 2**0.25, 0.9, 1 << 18
 
 
-#: Numbers of positions at which the extinction on the boundary is sampled: for a percentile, and
-#: for the maximum, which a voxel in a corner of the data may have.
-FEW_POINTS, ALL_POINTS = 1 << 12, 1 << 18
+#: Number of positions at which the extinction on the boundary is sampled for a percentile; and for
+#: the maximum, which a voxel in a corner of the data may have, per voxel at a face of the data, and
+#: at most.
+FEW_POINTS, POINTS_PER_VOXEL, MOST_POINTS = 1 << 12, 8, 1 << 18
 
 
 @dataclass(frozen=True)
@@ -426,7 +427,11 @@ def border_depth(medium: MediumGrid, grid: Grid) -> float:
 
 def densest_border_depth(medium: MediumGrid, grid: Grid) -> float:
     """Return `border_depth` for the densest part of the boundary, however small it is."""
-    found = medium.sigma_t.at_world(_on_boundary(medium, ALL_POINTS))
+    data, count = medium.sigma_t.grid, FEW_POINTS
+    if data is not None:
+        faces = 2 * data.voxel_count * float((1 / data.resolution).sum())
+        count = int(np.clip(POINTS_PER_VOXEL * faces, FEW_POINTS, MOST_POINTS))
+    found = medium.sigma_t.at_world(_on_boundary(medium, count))
     return float(dr.max(dr.max(mi.Spectrum(found), axis=0))[0]) * grid.voxel_thickness.max()
 
 

@@ -164,7 +164,7 @@ CONSTANTS = [
     ),
     (
         "7-defaults",
-        r"at most (\d+) along the longest side \(`path`: (\d+)\)",
+        r"at most (\d+)\s+along each axis \(`path`: (\d+)\)",
         (SweepSolver.size_rule.most_by_contrast, PathSolver.size_rule.most_by_contrast),
     ),
     (

@@ -57,9 +57,9 @@ def test_an_image_is_the_same_to_the_last_bit_under_a_sun(density, tmp_path):
 
 
 def test_an_image_differs_by_rounding_alone_under_a_coloured_sky(density, tmp_path):
-    whole = load(INTEGRATOR, boundary(medium(2 * density, 0.9, PLACE), PLACE))
+    whole = load(INTEGRATOR, boundary(medium(0.5 * density, 0.9, PLACE), PLACE))
     # A constant extinction in the scene is the factor of the values in the file.
-    parts = scene_of(tmp_path, medium(2.0, 0.9, PLACE))
+    parts = scene_of(tmp_path, medium(0.5, 0.9, PLACE))
     np.testing.assert_allclose(image(parts, spp=2), image(whole, spp=2), rtol=1e-4)
 
 
