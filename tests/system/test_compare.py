@@ -80,12 +80,12 @@ def compare(folder: Path, *arguments) -> int:
 def report(folder):
     """Create a report in which one of three integrators is killed after its first snapshot.
 
-    Five images determine the number of samples whose image takes 50 ms. The eight after them take
-    about 0.4 s, far from both budgets on slower and faster machines.
+    Five images determine the number of samples whose image takes 50 ms. The twelve after them
+    take about 0.6 s, far from both budgets on slower and faster machines.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
-        integrators = ["-i", "volpath", "-i", "mortal{lives=13}", "-i", "irrcache{resolution=12}"]
+        integrators = ["-i", "volpath", "-i", "mortal{lives=17}", "-i", "irrcache{resolution=12}"]
         options = ["--budget", "0.1,1.5", "--import", "mortal_plugin", "-o", folder / "report"]
         status = compare(folder, *integrators, *options)
     assert status == 1 and (folder / "report" / "report.html").exists()  # one failed
@@ -105,7 +105,7 @@ def test_finished_measurements_survive_a_crash(report):
         assert all(measurement[start] for start in ("cold", "warm", "again", "memory"))
     assert "SIGKILL" in killed["error"]
     assert [s["budget"] for s in killed["snapshots"]] == [0.1]
-    assert "mortal{lives=13} did not finish" in (report / "report.html").read_text(encoding="utf-8")
+    assert "mortal{lives=17} did not finish" in (report / "report.html").read_text(encoding="utf-8")
 
 
 def test_stages(report):
