@@ -387,21 +387,19 @@ def means_at_faces(values: mi.Spectrum, grid: Grid, voxels: mi.UInt32, layers: i
     """Return values at the centres of ``voxels``, replaced by means along the normal of each face
     of the grid in the outermost ``layers`` of voxels there, see `values_at_centres`.
     """
-    index, places = voxels, grid.voxel_indices(voxels)
     if not layers:
         return values
+    places, strides = grid.voxel_indices(voxels), strides_of(grid.resolution)
     result = []
     for value in values:
         volume = dr.zeros(mi.Float, grid.voxel_count)
-        dr.scatter(volume, value, index)
+        dr.scatter(volume, value, voxels)
         factor = mi.Float(1)
-        for at, stride, count in zip(
-            places, strides_of(grid.resolution, (0, 1, 2)), grid.resolution, strict=True
-        ):
+        for at, stride, count in zip(places, strides, grid.resolution, strict=True):
             if count < 3:
                 continue
             stride, last = (dr.opaque(mi.UInt32, int(n)) for n in (stride, count - 1))
-            centre = index + dr.select(at == 0, stride, 0) - dr.select(at == last, stride, 0)
+            centre = voxels + dr.select(at == 0, stride, 0) - dr.select(at == last, stride, 0)
             around = centre - stride, centre, centre + stride
             below, here, above = (dr.gather(mi.Float, volume, i) for i in around)
             in_layers = (at < layers) | (at + layers > last)
