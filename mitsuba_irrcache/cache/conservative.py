@@ -33,7 +33,8 @@ def conserving(
 ) -> mi.Float:
     """Correct square ``roots`` such that interpolation preserves the values of ``known`` voxels.
 
-    ``share`` in [0, 1], per voxel, is the power to which the correction factor is raised; None: 1.
+    ``share`` in [0, 1], per voxel and channel, is the power to which the correction factor is
+    raised; None: 1.
 
     The correction acts along axes along which both neighbours are known, and not ``separated`` by
     surfaces (`VoxelClasses`), where interpolation does not mix their values. Noise that differs
@@ -47,8 +48,7 @@ def conserving(
     ratio = dr.select(smoothed > 0, roots / smoothed, 1)
     factor = dr.sqrt(ratio)
     if share is not None:
-        place = dr.arange(mi.UInt32, dr.width(roots)) // channels
-        factor = dr.power(ratio, 0.5 * dr.gather(mi.Float, share, place))
+        factor = dr.power(ratio, 0.5 * share)
     result = roots * dr.select(ratio > 0, factor, 1)
     dr.eval(result)
     return result

@@ -38,10 +38,12 @@ def irradiance_field(
     variance = share = None
     if sums.has_own_errors:  # those shared by neighbours do not bias interpolation
         noise = [sums.relative_variance(m, c) for c, m in enumerate(means)]
-        mean = on_grid(grid, active, [sum(noise) / len(noise)]).array
-        share = share_of_noise(grid, mean, known)
-        rest = 1 - dr.gather(mi.Float, share, active)
-        roots = [r * root_correction(v * rest) for r, v in zip(roots, noise, strict=True)]
+        shares = [share_of_noise(grid, on_grid(grid, active, [v]).array, known) for v in noise]
+        at_active = [dr.gather(mi.Float, each, active) for each in shares]
+        roots = [
+            r * root_correction(v * (1 - each))
+            for r, v, each in zip(roots, noise, at_active, strict=True)
+        ]
     if all(dr.all(r == roots[0])[0] for r in roots[1:]):
         roots = roots[:1]
     channels = len(roots)
@@ -51,6 +53,7 @@ def irradiance_field(
     values = on_grid(grid, active, roots).array
     if sums.has_own_errors:
         variance = on_grid(grid, active, noise[:channels]).array
+        share = on_grid(grid, active, at_active[:channels]).array
     border = border_of(sums, interpolation)
     field = root_field(grid, values, known, channels, border, classes, share, variance)
     if falloff is not None:
@@ -79,7 +82,8 @@ def root_field(
 ) -> RootField:
     """Create a field from square ``roots`` of the values of ``known`` voxels.
 
-    ``share`` is that of `conserving`, ``variance`` the relative variance of noisy values.
+    ``share`` is that of `conserving`, ``variance`` the relative variance of noisy values, both in
+    each channel.
     """
     fitted, separated = None, None if classes is None else classes.separated
     if border is not None:

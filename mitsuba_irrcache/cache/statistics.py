@@ -38,8 +38,8 @@ class BatchSums(Immutable):
         spreads: for each channel, the sum of squared deviations of the batches' irradiance (of
             all orders) from its mean.
         moments: sums of batch means for each angular moment and channel, float32.
-        own_spread: if `is_correlated`, the sum of the variances of those parts of the batches' mean
-            irradiance (of all channels) that are sampled for each voxel alone, float32.
+        own_spreads: if `is_correlated`, for each channel the sum of the variances of those parts of
+            the batches' irradiance that are sampled for each voxel alone, float32.
 
     An array that is None stands for 0.
     """
@@ -55,7 +55,7 @@ class BatchSums(Immutable):
         self.totals: list = [None] * (len(ORDER_GROUPS) * channels)
         self.spreads: list = [None] * channels
         self.moments: list = [None] * (moments * channels)
-        self.own_spread: mi.Float | None = None
+        self.own_spreads: list = [None] * channels
 
     def _with(self, **changes: Any) -> BatchSums:
         """Return a copy with other attributes."""
@@ -95,14 +95,14 @@ class BatchSums(Immutable):
     @property
     def has_own_errors(self) -> bool:
         """Whether errors differ between neighbouring voxels."""
-        return not self.is_correlated or self.own_spread is not None
+        return not self.is_correlated or any(spread is not None for spread in self.own_spreads)
 
     def relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
         """Return the variance of each voxel that is independent of its neighbours, over the squared
         ``mean``, at most 1; 0 if unknown.
         """
         if self.is_correlated:
-            n, spread = self._batch_count, self.own_spread
+            n, spread = self._batch_count, self.own_spreads[channel]
             variance = None if spread is None else spread / dr.square(n)
         else:
             variance = self.variance(channel)
@@ -125,11 +125,11 @@ class BatchSums(Immutable):
     # ------------------------------------------------------------------ more samples
 
     def with_blocks(
-        self, seed: int, samples: int, blocks: list[tuple], own_spread: mi.Float | None = None
+        self, seed: int, samples: int, blocks: list[tuple], own_spreads: list | None = None
     ) -> BatchSums:
         """Return sums with ``samples`` more per voxel from the stream ``seed``, evaluated.
 
-        See `IrradianceCache.add` for the ``blocks`` and ``own_spread``.
+        See `IrradianceCache.add` for the ``blocks`` and ``own_spreads``.
         """
         totals, spreads, *moments = (
             [concatenated(part) for part in zip(*parts, strict=True)]
@@ -137,13 +137,14 @@ class BatchSums(Immutable):
         )
         merged = self._merged(totals, spreads, samples // self.batch)
         moments = totals_of_pairs(self.moments, *moments) if moments else self.moments
-        return self._evaluated(merged, moments, own_spread, {seed: samples})
+        own_spreads = own_spreads or [None] * self.channels
+        return self._evaluated(merged, moments, own_spreads, {seed: samples})
 
     def with_sums(self, other: BatchSums) -> BatchSums:
         """Return sums with all samples of ``other`` added, evaluated."""
         merged = self._merged(other.totals, other.spreads, other.samples // other.batch)
         moments = totals_of_pairs(self.moments, other.moments)
-        return self._evaluated(merged, moments, other.own_spread, other.streams)
+        return self._evaluated(merged, moments, other.own_spreads, other.streams)
 
     def with_count(self, seed: int, samples: int) -> BatchSums:
         """Return sums that count samples whose contribution has been added already or is zero."""
@@ -161,7 +162,7 @@ class BatchSums(Immutable):
         totals: list,
         spreads: list,
         moments: list,
-        own_spread: mi.Float | None = None,
+        own_spreads: list,
     ) -> BatchSums:
         """Return sums at the same voxels with these values."""
         return self._with(
@@ -169,19 +170,19 @@ class BatchSums(Immutable):
             totals=totals,
             spreads=spreads,
             moments=moments,
-            own_spread=own_spread,
+            own_spreads=own_spreads,
         )
 
     def _evaluated(
         self,
         merged: tuple[list, list],
         moments: list,
-        own_spread: mi.Float | None,
+        own_spreads: list,
         streams: dict,
     ) -> BatchSums:
-        own_spread = total([self.own_spread, own_spread])
-        dr.eval(merged, moments, own_spread)
-        return self.filled(self._counted(streams), *merged, moments, own_spread)
+        own_spreads = totals_of_pairs(self.own_spreads, own_spreads)
+        dr.eval(merged, moments, own_spreads)
+        return self.filled(self._counted(streams), *merged, moments, own_spreads)
 
     def _counted(self, streams: dict[int, int]) -> dict[int, int]:
         more = {seed: self.streams.get(seed, 0) + n for seed, n in streams.items()}

@@ -16,10 +16,10 @@ from mitsuba_irrcache.errors import CacheFileError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.io.files import atomic_write
 
-#: The number changes when files of earlier versions would be read wrongly: before 8, values of
-#: single scattering at dense faces were those at the centres of voxels, not means.
-FORMAT = "mitsuba_irrcache 8"
-WITH_MOMENTS = "mitsuba_irrcache 9"  # with angular moments of the radiance
+#: The number changes when files of earlier versions would be read wrongly: before 10, variances of
+#: what is sampled for each voxel alone were those of the mean over the channels.
+FORMAT = "mitsuba_irrcache 10"
+WITH_MOMENTS = "mitsuba_irrcache 11"  # with angular moments of the radiance
 ARRAYS = ("active", "totals", "spreads")  # arrays of a file in addition to the description
 
 
@@ -41,7 +41,7 @@ class StoredCache:
 def write_cache(path: str | Path, stored: StoredCache) -> None:
     """Write a cache with all its statistics, atomically: a failure leaves no partial file."""
     sums, grid = stored.sums, stored.grid
-    moments = sums.moment_count
+    moments, own = sums.moment_count, any(v is not None for v in sums.own_spreads)
     description = {
         "format": WITH_MOMENTS if moments else FORMAT,
         "shape": grid.shape,
@@ -63,7 +63,7 @@ def write_cache(path: str | Path, stored: StoredCache) -> None:
         "totals": plain(sums.totals),
         "spreads": plain(sums.spreads),
         **({"moments": plain(sums.moments, np.float32)} if moments else {}),
-        **({"own_spread": plain([sums.own_spread])} if sums.own_spread is not None else {}),
+        **({"own_spreads": plain(sums.own_spreads, np.float32)} if own else {}),
     }
     description["values"] = digest_of_arrays(arrays)
     description["digest"] = digest_of_description(description)
@@ -113,16 +113,16 @@ def _restored(description: dict, arrays: dict[str, np.ndarray]) -> StoredCache:
     moments = arrays["moments"] if count else np.zeros((0, width), np.float32)
     _check_sums(totals, spreads, (channels, width), np.float32 if correlated else np.float64)
     _check_moments(moments, (count * channels, width))
-    own_spread = arrays.get("own_spread", np.zeros((1, width), np.float32))
-    if (own_spread.shape, own_spread.dtype) != ((1, width), np.float32):
-        raise ValueError(f"own_spread of shape {own_spread.shape} and type {own_spread.dtype}")
-    _check_values((totals, spreads, own_spread), moments)
+    own = arrays.get("own_spreads", np.zeros((channels, width), np.float32))
+    if (own.shape, own.dtype) != ((channels, width), np.float32):
+        raise ValueError(f"own_spreads of shape {own.shape} and type {own.dtype}")
+    _check_values((totals, spreads, own), moments)
     streams, batch = samples_by_seed(description), int(description["batch"])
     smallest, largest = (1, MAX_BATCH) if correlated else (BATCH, BATCH)
     if not smallest <= batch <= largest or any(n % batch for n in streams.values()):
         raise ValueError(f"samples {streams} in batches of {batch}")
     batches = sum(streams.values()) // batch
-    any_sums = totals.any() or own_spread.any()
+    any_sums = totals.any() or own.any()
     if (batches < 1 and any_sums) or (batches < 2 and spreads.any()):
         raise ValueError(f"non-zero sums, but only {batches} batches of samples")
     check_digest(description)
@@ -132,10 +132,9 @@ def _restored(description: dict, arrays: dict[str, np.ndarray]) -> StoredCache:
     sums = sums.filled(
         streams,
         *(
-            _known(values, kind)
-            for values, kind in ((totals, sums.real), (spreads, sums.real), (moments, mi.Float))
+            _known(values, sums.real if values is totals or values is spreads else mi.Float)
+            for values in (totals, spreads, moments, own)
         ),
-        *_known(own_spread, mi.Float),
     )
     max_depth, fingerprint = int(description["max_depth"]), dict(description["fingerprint"])
     return StoredCache(grid, mi.UInt32(active), max_depth, fingerprint, sums)
@@ -225,5 +224,5 @@ def read_arrays(path: Path, names: tuple[str, ...] = ARRAYS) -> dict[str, np.nda
             raise ValueError("it is compressed")
     with np.load(path, allow_pickle=False) as archive:
         if names:
-            names = (*names, *sorted({"moments", "own_spread"} & set(archive.files)))
+            names = (*names, *sorted({"moments", "own_spreads"} & set(archive.files)))
         return {name: archive[name] for name in ("description", *names)}

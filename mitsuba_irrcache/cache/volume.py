@@ -259,7 +259,7 @@ class IrradianceCache:
         seed: int,
         samples: int,
         blocks: list[tuple],
-        own_spread: mi.Float | None = None,
+        own_spreads: list[mi.Float | None] | None = None,
     ) -> None:
         """Add ``samples`` per voxel of the stream ``seed``.
 
@@ -267,10 +267,10 @@ class IrradianceCache:
         batch means for each order group and channel; for each channel, the sum of squared
         deviations of the batches' irradiance from its mean; and, for anisotropic scattering, the
         sums of batch means for each moment and channel. None, in all blocks, represents 0.
-        ``own_spread`` is that of `BatchSums`.
+        ``own_spreads`` is that of `BatchSums`; None stands for 0.
         """
         # One assignment: an interrupt cannot leave inconsistent sums.
-        self._sums = self._sums.with_blocks(seed, samples, blocks, own_spread)
+        self._sums = self._sums.with_blocks(seed, samples, blocks, own_spreads)
 
     @_consistent
     def note_samples(self, seed: int, samples: int) -> None:

@@ -40,8 +40,8 @@ class _Collector(IrradianceCache):
         self._sums = self._sums.empty().with_count(seed, batches * self.batch)
         self.found = self.empty_copy()
 
-    def add(self, seed: int, samples: int, blocks: list[tuple], own_spread=None) -> None:
-        self.found.add(seed, samples, blocks, own_spread)
+    def add(self, seed: int, samples: int, blocks: list[tuple], own_spreads=None) -> None:
+        self.found.add(seed, samples, blocks, own_spreads)
         self.note_samples(seed, samples)
 
 

@@ -28,10 +28,12 @@ def first_opaque(
     active: mi.Bool,
     exact: bool,
 ):
-    """Find the first surface along ``ray`` that is not null, invalid where there is none.
+    """Find the first surface along ``ray`` that emits or lets nothing through, invalid where there
+    is none.
 
-    Returns it with the transmittance of null surfaces and media before it, without noise if
-    ``exact``, and the random generator.
+    Surfaces that partly transmit are passed like null ones, as by `transport.path.visibility`: the
+    densities of a sampled emitter then count both ways to find it. Returns the surface with the
+    transmittance of what lies before it, without noise if ``exact``, and the random generator.
     """
     ray, pointer, active = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(active)
     end, attenuation = dr.zeros(mi.SurfaceInteraction3f), mi.Spectrum(1)
@@ -43,9 +45,10 @@ def first_opaque(
         else:
             factor, rng = media.transmittance(pointer, ray, si.t, rng, active)
         attenuation = dr.select(active, attenuation * factor, attenuation)
-        null = active & si.is_valid() & is_null(si.bsdf().flags())
+        hit = active & si.is_valid()
+        factor = si.bsdf().eval_null_transmission(si, hit)
+        null = hit & (si.emitter(scene, hit) == None) & (dr.max(factor) > 0)  # noqa: E711
         end = dr.select(active & ~null, si, end)
-        factor = si.bsdf().eval_null_transmission(si, null)
         attenuation = dr.select(null, attenuation * factor, attenuation)
         pointer = dr.select(null, medium_after(si, ray.d, pointer), pointer)
         ray = si.spawn_ray(ray.d)

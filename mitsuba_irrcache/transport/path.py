@@ -246,24 +246,26 @@ def trace_to_infinity(
     lamps: Sequence[mi.EmitterPtr],
     rng: mi.PCG32,
     active: mi.Bool,
+    clear: mi.Bool = False,
 ):
     """Follow ``ray`` straight through null surfaces and ``media`` until it leaves the scene.
 
-    Returns unbiased estimates of the transmittance (0 if a surface blocks the ray) and of the
-    radiance from emissive media and those ``lamps`` that the ray hits, and the random number
-    generator.
+    ``clear`` states that there is no medium before the first surface. Returns unbiased estimates of
+    the transmittance (0 if a surface blocks the ray) and of the radiance from emissive media and
+    those ``lamps`` that the ray hits, and the random number generator.
     """
     attenuation, radiance, escaped = mi.Spectrum(1), mi.Spectrum(0), mi.Bool(False)
     ray, pointer, active = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(active)
-    crossings = mi.UInt32(0)
+    crossings, clear = mi.UInt32(0), mi.Bool(clear)
     while dr.hint(active, label="out of the scene"):
         si = scene.ray_intersect(ray, active)
-        hit = active & si.is_valid()
+        hit, within = active & si.is_valid(), active & ~clear
         if dr.hint(media.is_emissive, mode="scalar"):
-            *_, rng, emitted = media.sample_distance(pointer, ray, si.t, attenuation, rng, active)
-            radiance += dr.select(active, emitted, 0)
-        factor, rng = media.transmittance(pointer, ray, si.t, rng, active)
-        attenuation = dr.select(active, attenuation * factor, attenuation)
+            *_, rng, emitted = media.sample_distance(pointer, ray, si.t, attenuation, rng, within)
+            radiance += dr.select(within, emitted, 0)
+        factor, rng = media.transmittance(pointer, ray, si.t, rng, within)
+        attenuation = dr.select(within, attenuation * factor, attenuation)
+        clear = mi.Bool(False)
         escaped |= active & ~hit
         for lamp in lamps:
             hit_lamp = hit & (si.shape.emitter() == lamp)

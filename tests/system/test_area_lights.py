@@ -318,3 +318,41 @@ def test_cache_outlives_its_scene(scenes):
     later = fog(scenes, "disk inside", solver="path", resolution=8)
     assert np.isfinite(scenes.image(later, spp=1)).all()
     assert cache.direct_lights
+
+
+@pytest.mark.usefixtures("rgb")
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_texels_of_different_colours(scenes, scale):
+    """A textured square above fog has the light of its texels, which have closed forms.
+
+    In each channel, blocks of pixels are right to 2.5 % of the mean. They were 28 to 107 % wrong in
+    the channels of the darker texel: it had a point or two for each voxel, and the bias of
+    interpolated roots was corrected with the variance of the brighter channel.
+    """
+    colours = {(1, 2): (40.0, 0.0, 0.0), (3, 0): (0.0, 0.5, 1.0)}
+    texels = np.zeros((4, 4, 3), np.float32)
+    for texel, colour in colours.items():
+        texels[texel] = colour
+    square = mi.ScalarTransform4f().translate([0, 1.4, 0]).rotate([1, 0, 0], 90).scale(scale)
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "filter_type": "nearest"}
+    textured = {"type": "rectangle", "to_world": square}
+    textured = [textured | {"emitter": {"type": "area", "radiance": bitmap}}]
+    single = [
+        {
+            "type": "rectangle",
+            "to_world": square.translate([(i + 0.5) / 2 - 1, (j + 0.5) / 2 - 1, 0]).scale(0.25),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(colour)}},
+        }
+        for (j, i), colour in colours.items()
+    ]
+    images = []
+    for first, *more in (textured, single):
+        integrator = {"type": "irrcache", "solver": "sweep", "max_depth": 2, "hide_emitters": True}
+        cube = scenes.boundary(scenes.medium(SIGMA_T, ALBEDO))
+        objects = {"emitter": first, "sun": None} | dict(zip("abc", more, strict=False))
+        scene = mi.load_dict(scenes.description(integrator, cube, SIZE, **objects))
+        images.append(np.array(mi.render(scene, spp=SPP)))
+    count = SIZE // BLOCK
+    error = (images[0] - images[1]).reshape(count, BLOCK, count, BLOCK, 3).mean(axis=(1, 3))
+    error /= images[1].mean(axis=(0, 1))
+    assert np.abs(error).max() < 0.025

@@ -113,7 +113,9 @@ def test_stages(report):
     stock, _, ours = read(report)["measurements"]
     for measurement in (stock, ours):
         cold, warm = measurement["cold"], measurement["warm"]
-        assert cold["backend"] > warm["backend"]  # "kernels" is a difference, noise of a busy machine
+        assert (
+            cold["backend"] > warm["backend"]
+        )  # "kernels" is a difference, noise of a busy machine
         assert 0 < cold["import"] < 60 and cold["load"] > 0
     assert "cache" not in stock["cold"]
     assert ours["again"]["cache"] < 0.5 * ours["cold"]["cache"]

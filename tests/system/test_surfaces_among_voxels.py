@@ -98,10 +98,18 @@ def test_shadow_of_a_sheet(scenes, height):
 
 
 NAMES = "coloured ball", "rod", "two-sided sheet", "ground that cuts", "luminous ball", "mirror"
+#: Objects that transmit: the medium behind them attenuates what passes.
+TRANSMITTING = "mask", "thin dielectric"
+
+
+def sheet(bsdf: dict) -> dict:
+    place = placed((0, 0.1, 0), (0.6, 0.6, 1), (0.3, 1, 0.2))
+    return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
 
 
 def object_named(name: str) -> dict:
-    """Return one of the objects `NAMES`."""
+    """Return one of the objects `NAMES` and `TRANSMITTING`."""
+    two_sided = {"type": "twosided", "bsdf": diffuse(0.7, 0.7, 0.7)}
     found = {
         "coloured ball": {"object": ball((0.2, 0.1, 0), bsdf=diffuse(0.8, 0.3, 0.2))},
         "rod": {
@@ -113,13 +121,9 @@ def object_named(name: str) -> dict:
                 "bsdf": diffuse(0, 0, 0),
             }
         },
-        "two-sided sheet": {
-            "object": {
-                "type": "rectangle",
-                "to_world": placed((0, 0.1, 0), (0.6, 0.6, 1), (0.3, 1, 0.2)),
-                "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.7, 0.7)},
-            }
-        },
+        "two-sided sheet": {"object": sheet(two_sided)},
+        "mask": {"object": sheet({"type": "mask", "opacity": 0.5, "nested": two_sided})},
+        "thin dielectric": {"object": sheet({"type": "thindielectric"})},
         "ground that cuts": {
             "object": {
                 "type": "rectangle",
@@ -145,6 +149,7 @@ def object_named(name: str) -> dict:
         ),
         ("two-sided sheet", 2),
         ("luminous ball", 2),
+        *((name, -1) for name in TRANSMITTING),
     ],
 )
 def test_voxels_equal_those_of_the_solver_path(scenes, name, depth):

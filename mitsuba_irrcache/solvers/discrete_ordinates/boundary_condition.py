@@ -83,7 +83,8 @@ class SurfaceBoundary:
         self.surfaces = surfaces
         self.scene, self.medium, self.media = scene, medium, Media.around(medium)
         self.pointer, self.area_emitters = medium.pointer, list(area_emitters)
-        #: the other media; ``medium`` is convex, so a straight ray that leaves it never returns
+        #: the other media; ``medium`` is convex, so a straight ray that leaves it never returns.
+        #: Rays through transmitting surfaces among the voxels continue in it.
         self.other_media = self.media.without(medium)
         self.angular_basis = angular_basis
         #: whether radiance is refracted when it enters the medium, and reflected inside
@@ -537,8 +538,11 @@ def _trace_all(
     visible = hit & (dr.max(sum(parts)) > 0)
     if boundary.has_sources:
         visible |= hit & (weight > 0)
+    # The medium up to the first surface is part of the track.
+    media = boundary.other_media if boundary.surfaces is None else boundary.media
+    emitters, clear = boundary.area_emitters, pointer == boundary.pointer
     transmittance, radiance, rng = trace_to_infinity(
-        boundary.scene, boundary.other_media, ray, pointer, boundary.area_emitters, rng, visible
+        boundary.scene, media, ray, pointer, emitters, rng, visible, clear
     )
     parts = [irradiance * transmittance for irradiance in parts]
     parts[0] += weight * radiance

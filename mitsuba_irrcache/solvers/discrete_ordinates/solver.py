@@ -145,8 +145,9 @@ class Sweep:
         #: they follow from the direction
         self._direct: list[list[mi.Spectrum]] = []
         self._emission: list[list[mi.Spectrum]] = []
-        #: sum of the variances of what is sampled voxel by voxel in a batch; None: nothing
-        self._own_spread: mi.Float | None = None
+        #: for each channel, the sum of the variances of what is sampled voxel by voxel in a batch;
+        #: None: nothing
+        self._own_spreads: list[mi.Float] | None = None
         #: irradiance of suns that are direct lights of the cache
         self._sun_irradiance: list[mi.Spectrum] = []
         #: factors of the channels of a batch's results
@@ -255,7 +256,7 @@ class Sweep:
         first, count = cache.streams.get(self.seed, 0) // cache.batch, samples // cache.batch
         for number in range(first, first + count):
             batch = self._batch(number)
-            cache.add(self.seed, cache.batch, [batch], self._own_spread)
+            cache.add(self.seed, cache.batch, [batch], self._own_spreads)
             if progress is not None:
                 dr.sync_thread()
                 done = (number - first + 1) * cache.batch
@@ -270,7 +271,7 @@ class Sweep:
         moments if any.
         """
         cache, seed = self.cache, (self.seed, number)
-        self._own_spread = None
+        self._own_spreads = None
         if self._medium.emission is not None:
             arguments = self._medium, self._sample_points, cache.batch // 2
             self._emission = [
@@ -343,11 +344,12 @@ class Sweep:
         """
         cache_seed, number = seed
         first, second = (estimate((cache_seed, 2 * number + half)) for half in (0, 1))
-        error = sum(a - b for a, b in zip(first[0], second[0], strict=True)) / (2 * len(first[0]))
-        variance = dr.square(error)
-        self._own_spread = variance if self._own_spread is None else self._own_spread + variance
+        variances = [dr.square(0.5 * (a - b)) for a, b in zip(first[0], second[0], strict=True)]
+        if self._own_spreads is not None:
+            variances = [a + b for a, b in zip(self._own_spreads, variances, strict=True)]
+        self._own_spreads = variances
         mean = [0.5 * (a + b) for a, b in zip(first, second, strict=True)]
-        dr.eval(mean, self._own_spread)
+        dr.eval(mean, self._own_spreads)
         return mean
 
     def _first_pairs(self, pairs: int) -> int:

@@ -35,20 +35,26 @@ def test_a_field_with_a_sharp_end_is_conserved(kind):
 
 @pytest.mark.parametrize("correlated", [True, False])
 def test_errors_of_voxels_do_not_bias_lookups(correlated):
-    """Errors that differ between neighbours do not change the mean up to the faces of the grid,
-    with a relative variance of 0.06; if the variance is neglected, it is 0.8 % too large, because
-    extrapolation to the faces is not linear.
+    """Errors that differ between neighbours do not change the mean of any channel up to the faces
+    of the grid, with relative variances of 0.06, 0 and 0.02; if the variance is neglected, the mean
+    is 0.8 % too large, because extrapolation to the faces is not linear.
     """
-    shape, variance = (72, 72, 4), 0.06
+    shape, variances, scales = (72, 72, 4), (0.06, 0.0, 0.02), (1.0, 30.0, 1e-3)
     count = int(np.prod(shape))
     grid, voxels = Grid(shape, np.eye(4)), mi.UInt32(np.arange(count, dtype=np.uint32))
-    phi = np.random.default_rng(2).gamma(1 / variance, variance, count)
-    cache = IrradianceCache(grid, voxels, 1, -1, correlated=correlated)
-    spread = cache.real(np.full(count, 2 * variance))
-    own = {"own_spread": mi.Float(np.full(count, 4 * variance))} if correlated else {}
-    values = cache.real(2 * phi)  # of two batches
-    cache.add(0, 2 * BATCH, [((values, None), (None if correlated else spread,))], **own)
+    rng = np.random.default_rng(2)
+    phi = [
+        s * (rng.gamma(1 / v, v, count) if v else 1) for v, s in zip(variances, scales, strict=True)
+    ]
+    phi = [np.broadcast_to(values, count) for values in phi]
+    squares = [v * s**2 for v, s in zip(variances, scales, strict=True)]
+    cache = IrradianceCache(grid, voxels, 3, -1, correlated=correlated)
+    totals = tuple(cache.real(2 * values) for values in phi)  # of two batches
+    spreads = tuple(cache.real(np.full(count, 2 * square)) for square in squares)
+    own = [mi.Float(np.full(count, 4 * square)) for square in squares]
+    blocks = [((*totals, None, None, None), 3 * (None,) if correlated else spreads)]
+    cache.add(0, 2 * BATCH, blocks, own if correlated else None)
     points = ((np.arange(3 * n) + 0.5) / (3 * n) for n in shape[::-1])
     u = np.stack(np.meshgrid(*points)).reshape(3, -1)
-    found = float(np.array(cache.field().at_world(mi.Point3f(np.float32(u))), np.float64).mean())
-    assert found == pytest.approx(phi.mean(), rel=0.003)
+    found = np.array(cache.field().at_world(mi.Point3f(np.float32(u))), np.float64).mean(axis=1)
+    assert found == pytest.approx([values.mean() for values in phi], rel=0.003)

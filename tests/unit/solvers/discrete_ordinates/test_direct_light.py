@@ -9,6 +9,9 @@ import pytest
 
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import (
+    FEWEST_SAMPLES,
+    MOST_RAYS,
+    MOST_SAMPLES,
     EmitterSampling,
     is_area_emitter,
 )
@@ -45,3 +48,33 @@ def test_sampled_emitters_add_up(scenes, count):
     error = light.std() / np.sqrt(len(light))
     assert error < 0.02 * expected
     assert abs(light.mean() - expected) < 4 * error + 1e-3 * expected
+
+
+def test_the_number_of_points_follows_the_variance(scenes):
+    """A distant sphere takes the fewest points; texels of different colours above the medium take
+    more, and fewer at more positions.
+    """
+    texels = np.zeros((4, 4, 3), np.float32)
+    texels[1, 2], texels[2, 0] = (40, 0, 0), (0, 1, 1)
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+    above = mi.ScalarTransform4f().translate([0, 1.4, 0]).rotate([1, 0, 0], 90)
+    lamps = {
+        "far": {"type": "sphere", "center": [0, 9, 0], "radius": 0.5},
+        "near": {"type": "rectangle", "to_world": above},
+    }
+    lamps["far"]["emitter"] = {"type": "area", "radiance": 1.0}
+    lamps["near"]["emitter"] = {"type": "area", "radiance": radiance}
+    found = {}
+    for name, lamp in lamps.items():
+        integrator = {"type": "irrcache", "solver": "sweep"}
+        shape = scenes.boundary(scenes.medium(0.5, 0.5))
+        scene = scenes.load(integrator, shape, 2, emitter=None, sun=None, lamp=lamp)
+        (medium,) = compile_scene(scene).visible
+        for width in (16, 48):
+            rng = np.random.default_rng(width)
+            p = mi.Point3f(np.float32(rng.uniform(-1, 1, (3, width**3))))
+            sampling = EmitterSampling(scene, medium, scene.emitters(), [], p)
+            found[name, width] = sampling.points_per_voxel
+    assert found["far", 16] == found["far", 48] == FEWEST_SAMPLES
+    assert found["near", 16] == MOST_SAMPLES
+    assert FEWEST_SAMPLES < found["near", 48] <= MOST_RAYS // 48**3
