@@ -121,13 +121,14 @@ class MappedMedium:
         medium, files = _only_medium(scene, description), self._files
         sigma_t_file = VolumeFile(files.sigma_t)
         grid = Grid(sigma_t_file.shape, _placement(medium))
-        inputs = self._inputs(scene, description, medium, grid)
         sigma_t = MappedField(
             sigma_t_file, grid, _scale(medium), f'sigma_t of medium "{medium.name}"'
         )
         changes = {"sigma_t": sigma_t, "macrocells": sigma_t.macrocells()}
         if files.albedo:
             changes["albedo"] = _albedo(VolumeFile(files.albedo), grid, medium.name)
+        mapped = [changes[name] for name in ("sigma_t", "albedo") if name in changes]
+        inputs = self._inputs(scene, description, medium, mapped)
         self._medium = medium.replaced(**changes)
         if self._irradiance is not None:
             self._irradiance[0].close()
@@ -169,18 +170,21 @@ class MappedMedium:
         return SlabSweep(sigma_t, Path(self._folder.name), self._memory)
 
     def _inputs(
-        self, scene: mi.Scene, description: SceneDescription, medium: MediumGrid, grid: Grid
+        self,
+        scene: mi.Scene,
+        description: SceneDescription,
+        medium: MediumGrid,
+        mapped: list[MappedField],
     ) -> str:
         """Return the SHA-256 of everything that the irradiance depends on.
 
-        Volume files are represented by their sizes and times of modification.
+        ``medium`` is that of the scene, ``mapped`` are the fields in files.
         """
-        settings = self._settings
-        paths = [path for path in (self._files.sigma_t, self._files.albedo) if path]
+        settings, grid = self._settings, mapped[0].grid
         parts = [
-            [[part[1:3] for part in VolumeFile(path).state] for path in paths],
+            [field.digest for field in mapped],
             [grid.shape, grid.to_world.tolist(), _scale(medium)],
-            [settings.max_depth, settings.samples, settings.seed],
+            [settings.max_depth, settings.samples, settings.seed, settings.resolution],
             digests(scene, description.media, medium),
             installed_version(DISTRIBUTION),
         ]

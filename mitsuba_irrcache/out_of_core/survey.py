@@ -1,7 +1,8 @@
-"""A first pass over the file of a volume: bounds of its values, and invalid values."""
+"""A first pass over the file of a volume: bounds of its values, invalid values, and a digest."""
 
 from __future__ import annotations
 
+import hashlib
 from functools import reduce
 
 import drjit as dr
@@ -17,8 +18,8 @@ from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
 class MappedField:
     """A field of grey values at the voxel centres of ``grid``, which stay in a file.
 
-    ``scale`` multiplies every value, as in `GridField`. Raises IrrcacheError for values that are
-    negative or not finite.
+    ``scale`` multiplies every value, as in `GridField`; ``digest`` is that of the values. Raises
+    IrrcacheError for values that are negative or not finite.
     """
 
     channels = 1
@@ -28,7 +29,7 @@ class MappedField:
         self.scale = dr.opaque(mi.Float, scale)
         #: voxels along an edge of a macrocell
         self._cell = max(4, -(-max(grid.shape) // 64))
-        least, largest = self._bounds(what)
+        least, largest, self.digest = self._survey(what)
         self.maximum = float(largest.max()) * scale
         self.largest = float(np.float32(largest.max()) * np.float32(scale))
         self._ends = least, largest
@@ -46,13 +47,16 @@ class MappedField:
         """Return the scaled values of slices ``first`` to ``last - 1``, x fastest."""
         return mi.Float(self.file.read(first, last).ravel()) * self.scale
 
-    def _bounds(self, what: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the minimum and maximum over each macrocell, extended by one voxel."""
+    def _survey(self, what: str) -> tuple[np.ndarray, np.ndarray, str]:
+        """Return the minimum and maximum over each macrocell, extended by one voxel, and the
+        SHA-256 of all values.
+        """
         size, slices = self._cell, self.grid.shape[0]
-        found = []
+        found, sha = [], hashlib.sha256()
         for first in range(0, slices, size):
             lower, upper = max(first - 1, 0), min(first + size + 1, slices)
             values = self.file.read(lower, upper)
+            sha.update(values[first - lower : first - lower + size].data)
             ends = values.min(axis=0), values.max(axis=0)
             if not (ends[0].min() >= 0 and np.isfinite(ends[1]).all()):
                 _refuse(values, lower, what)
@@ -60,7 +64,7 @@ class MappedField:
                 ends, (np.minimum, np.maximum), strict=True
             )])  # fmt: skip
         least, largest = (np.stack(bounds) for bounds in zip(*found, strict=True))
-        return least, largest
+        return least, largest, sha.hexdigest()
 
 
 def _windows(values: np.ndarray, size: int, smaller: np.ufunc) -> np.ndarray:

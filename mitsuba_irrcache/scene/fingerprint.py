@@ -12,17 +12,17 @@ import numpy as np
 
 from mitsuba_irrcache.core.jit import graph_variables
 from mitsuba_irrcache.grids.fields import Field
+from mitsuba_irrcache.lights.emitters import SPOT_LIKE, EmittersByKind
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.path import Media
 
 #: Maximum number of bytes of an array, and of all arrays of a scene together, up to which whole
 #: contents are compared; number of values compared in larger arrays.
 SMALL, SMALL_IN_ALL, SAMPLED = 1 << 17, 1 << 19, 1 << 12
-
-
-#: Name of the input in `digests` that is compared with a tolerance, the number of its rays per
-#: shape, and the tolerance of their means.
-RESPONSES, RESPONSE_RAYS, TOLERANCE = "responses of surfaces", 512, 1e-4
+#: Names of the inputs in `digests` that are compared with a tolerance, the number of rays per
+#: shape and of positions per emitter, and the tolerance of their means.
+RESPONSES, RESPONSE_RAYS, BEAMS, POSITIONS = "responses of surfaces", 512, "beams", 4096
+TOLERANCE = 1e-4
 #: Parts of ``str(object)`` that are not properties of the object: mesh name, scene bounds, address.
 _ELSEWHERE = re.compile(
     r"\A\w+\[\s*name = [^\n]*|\bbsphere = \w+\[.*?\n *\],?|0x[0-9a-f]+", re.DOTALL
@@ -169,7 +169,8 @@ def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
 def digests(scene: mi.Scene, media: Media, medium: MediumGrid) -> dict[str, str]:
     """Return a digest (128 bits) of each input of the irradiance in ``medium``, by its name.
 
-    ``medium`` is one of the ``media`` of the scene. `RESPONSES` is not a digest, see `responses`.
+    ``medium`` is one of the ``media`` of the scene. `RESPONSES` and `BEAMS` are not digests, see
+    `responses`.
     """
     boundary = medium.boundary
     found = {
@@ -182,6 +183,7 @@ def digests(scene: mi.Scene, media: Media, medium: MediumGrid) -> dict[str, str]
         found["media"] = _digest(*sorted(_medium_digest(grid) for grid in media.grids))
         found["surfaces"] = digest_of_surfaces(scene)
         found[RESPONSES] = responses(scene)
+    found[BEAMS] = beams(scene)
     return found
 
 
@@ -202,7 +204,7 @@ def differing(mine: dict[str, str], theirs: dict[str, str]) -> list[str]:
 
 
 def _agree(name: str, mine: str | None, theirs: str | None) -> bool:
-    if name != RESPONSES or mine is None or theirs is None:
+    if name not in (RESPONSES, BEAMS) or mine is None or theirs is None:
         return mine == theirs
     try:
         first, second = (np.array(text.split(), dtype=np.float64) for text in (mine, theirs))
@@ -256,6 +258,23 @@ def responses(scene: mi.Scene) -> str:
     sums = [dr.block_sum(dr.select(valid, value, 0) * draws[12], RESPONSE_RAYS) for value in found]
     numbers = np.nan_to_num(np.array(sums, dtype=np.float64) / RESPONSE_RAYS, nan=1.0)
     return " ".join(f"{number:.6f}" for number in numbers.T.ravel())
+
+
+def beams(scene: mi.Scene) -> str:
+    """Return statistics of the irradiance from spot lights and projectors, as `responses`: the
+    filter of their textures is neither a traversed parameter nor part of ``str(emitter)``.
+    """
+    found, emitters = [], EmittersByKind(scene.emitters()).of(*SPOT_LIKE)
+    box = scene.bbox()
+    draws = [
+        mi.sample_tea_float32(dr.arange(mi.UInt32, POSITIONS), mi.UInt32(k), 6) for k in range(4)
+    ]
+    at = dr.zeros(mi.Interaction3f, POSITIONS)
+    at.p = mi.Point3f(box.min) + mi.Point3f(draws[:3]) * mi.Vector3f(box.max - box.min)
+    for emitter in sorted(emitters, key=_object_digest):
+        _, irradiance = emitter.sample_direction(at, mi.Point2f(0.5))
+        found.append(float(dr.mean(_squashed(irradiance) * draws[3])[0]))
+    return " ".join(f"{number:.6f}" for number in found)
 
 
 def _squashed(value: mi.Spectrum) -> mi.Float:

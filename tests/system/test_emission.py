@@ -270,6 +270,36 @@ def test_errors_between_neighbours_are_known(scenes):
     assert np.mean(variances) == pytest.approx(expected, rel=0.3)
 
 
+@pytest.mark.parametrize("edge", [2, 6])
+def test_a_small_flame_illuminates_far_voxels(scenes, edge):
+    """Far from an emissive block of ``edge``^3 of 32^3 voxels, the irradiance is that of a point of
+    the same power, in every voxel: points of the emission are sampled.
+
+    With random directions alone, which rarely hit the block, the relative standard deviation of
+    voxels was 1.2 to 12, and images were up to 48 % too dark.
+    """
+    sigma_t, side = 0.5, 32
+    values, centre = np.zeros((side,) * 3), slice((side - edge) // 2, (side + edge) // 2)
+    values[centre, centre, centre] = 50
+    place = scenes.placement()
+    emission = scenes.volume(values, place)
+    integrator = {"type": "irrcache", "emission": emission, "solver": "sweep", "max_depth": 2}
+    shape = scenes.boundary(scenes.medium(sigma_t, 0.8, place), place)
+    scene = scenes.load(integrator | {"resolution": 24}, shape, **DARK)
+    scene.integrator().prepare(scene)
+    (cache,) = scene.integrator().caches.values()
+    p = np.array(cache.grid.centers(cache.active), dtype=np.float64)
+    centre = place[:3, :3] @ np.full(3, 0.5) + place[:3, 3]
+    distance = np.linalg.norm(p - centre[:, None], axis=0)
+    power = values.sum() * abs(np.linalg.det(place[:3, :3])) / side**3
+    expected = power * np.exp(-sigma_t * distance) / distance**2
+    far = distance > 4 * edge / side
+    ratio = np.array(cache.irradiance)[..., 0].ravel()[far] / expected[far]
+    assert far.sum() > 1000
+    assert ratio.mean() == pytest.approx(1, abs=0.005)
+    assert ratio.std() < 0.05
+
+
 def test_orders(scenes):
     """Depth 0 has no emission; depth 1 has the unscattered emission, as background."""
     shape, light = flame(scenes)

@@ -35,7 +35,10 @@ from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import merge
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
 from mitsuba_irrcache.solvers.discrete_ordinates.crossings import SurfaceVoxels
 from mitsuba_irrcache.solvers.discrete_ordinates.cut_voxel_light import CutVoxelLight
-from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import emission_irradiance
+from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import (
+    EmissionPoints,
+    emission_irradiance,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import (
     EmitterSampling,
     split_by_solid_angle,
@@ -145,6 +148,7 @@ class Sweep:
         #: they follow from the direction
         self._direct: list[list[mi.Spectrum]] = []
         self._emission: list[list[mi.Spectrum]] = []
+        self._emission_points: EmissionPoints | None = None
         #: for each channel, the sum of the variances of what is sampled voxel by voxel in a batch;
         #: None: nothing
         self._own_spreads: list[mi.Float] | None = None
@@ -273,7 +277,9 @@ class Sweep:
         cache, seed = self.cache, (self.seed, number)
         self._own_spreads = None
         if self._medium.emission is not None:
-            arguments = self._medium, self._sample_points, cache.batch // 2
+            if self._emission_points is None and self._medium.emission.grid is not None:
+                self._emission_points = EmissionPoints(self._medium.emission)
+            arguments = self._medium, self._emission_points, self._sample_points, cache.batch // 2
             self._emission = [
                 self._mean_of_two(
                     seed, lambda own: emission_irradiance(*arguments, own, cache.directional)

@@ -88,13 +88,23 @@ def test_an_irradiance_file_of_the_same_inputs_is_read(density, tmp_path, monkey
     computed, written = rendered(), file.stat()
     np.testing.assert_array_equal(rendered(), computed)
     assert file.stat().st_mtime_ns == written.st_mtime_ns
-    # Another medium, a volume that was written again, and a file that somebody has written to.
+    # Another medium, a file that somebody has written to, and another volume: written later, or of
+    # the same size and time, as one of an archive may be.
     assert np.abs(rendered(3.0) - computed).max() > 0.01
     np.testing.assert_array_equal(rendered(), computed)
     np.save(file, np.load(file) * 2)
     np.testing.assert_array_equal(rendered(), computed)
-    np.save(tmp_path / "density.npy", density[::-1])
-    assert np.abs(rendered() - computed).max() > 0.01
+    volume = tmp_path / "density.npy"
+    past = volume.stat().st_mtime_ns
+    np.save(volume, density[::-1])
+    later = rendered()
+    assert np.abs(later - computed).max() > 0.01
+    np.save(volume, density)
+    os.utime(volume, ns=(past, past))
+    np.testing.assert_array_equal(rendered(), computed)
+    np.save(volume, density[::-1])
+    os.utime(volume, ns=(past, past))
+    np.testing.assert_array_equal(rendered(), later)
 
 
 def test_a_record_is_that_of_the_file_that_was_written_with_it(tmp_path, monkeypatch):

@@ -8,7 +8,9 @@ import pytest
 
 from mitsuba_irrcache.errors import CacheFileError
 from mitsuba_irrcache.scene.fingerprint import (
+    BEAMS,
     RESPONSES,
+    beams,
     differing,
     digest_of_emitters,
     digest_of_surfaces,
@@ -319,6 +321,23 @@ def test_the_same_scene_has_the_same_digests(folder, group):
     for plugin in GROUPS[group]:
         first, second = (digest(loaded(folder, group, plugin, {})) for _ in range(2))
         assert first == second, plugin
+
+
+@pytest.mark.parametrize("change", [{"filter_type": "nearest"}, {"wrap_mode": "mirror"}])
+@pytest.mark.parametrize(("plugin", "name"), [("spot", "texture"), ("projector", "irradiance")])
+def test_options_of_the_texture_of_a_beam_change_a_digest(plugin, name, change):
+    """They change the light in isolated media, too, where no ray hits a surface."""
+    texels = np.random.default_rng(2).random((4, 4, 3), np.float32)
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+    bitmap["to_uv"] = mi.ScalarTransform4f().scale([1.5, 1.5, 1])
+    look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    found = []
+    for texture in (bitmap, bitmap, bitmap | change):
+        emitter = {"type": plugin, "to_world": look, name: texture}
+        scene = mi.load_dict({"type": "scene", "shape": {"type": "cube"}, "emitter": emitter})
+        found.append({BEAMS: beams(scene)})
+    assert differing(found[0], found[1]) == []
+    assert differing(found[0], found[2]) == [BEAMS]
 
 
 def test_digests_ignore_names_and_order():
