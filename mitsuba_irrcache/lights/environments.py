@@ -45,7 +45,10 @@ def is_smooth(environment: mi.Emitter) -> bool:
     _, even = _even_radiance(environment)
     points = mi.Point2f(np.float32(lattice_points(SAMPLES, GOLDEN_STEP)))
     record, _ = environment.sample_direction(dr.zeros(mi.Interaction3f, SAMPLES), points)
-    sampled = environment_radiance(environment, -np.array(record.d, dtype=np.float64).T)
+    towards = np.array(record.d, dtype=np.float64)
+    if not even.any():  # a black map samples no direction: its directions are not a number
+        towards = np.where(np.isfinite(towards), towards, [[0], [0], [1]])
+    sampled = environment_radiance(environment, -towards.T)
     brightest = np.maximum(even.max(axis=0), sampled.max(axis=0))
     return bool((brightest <= SMOOTH_CONTRAST * even.mean(axis=0)).all())  # False with NaN
 

@@ -173,7 +173,8 @@ def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
     directions = np.array(record.d, dtype=np.float64)
     colours = np.stack([np.broadcast_to(np.array(c), SPOT_SAMPLES) for c in colours])
     irradiance = colours.mean(axis=0)
-    if not np.isfinite(irradiance).all() or directions.shape != (3, SPOT_SAMPLES):
+    finite = np.isfinite(irradiance).all() and np.isfinite(directions).all()
+    if not finite or directions.shape != (3, SPOT_SAMPLES):
         return [], np.full((2, len(colours)), np.nan)
     total, found, numbers = irradiance.sum(), [], np.zeros(SPOT_SAMPLES, int)
     while len(found) < MAX_SPOTS:

@@ -47,6 +47,8 @@ COARSER, COARSEST = 0.2, 0.03
 #: Optical depth of a step above which it is divided where the medium is dense at its boundary, into
 #: at most MOST_SUBSTEPS: the irradiance there decays within a fraction of a mean free path.
 SUBSTEP_DEPTH, MOST_SUBSTEPS = 0.15, 8
+#: Number of steps for each voxel of an emissive grid where no finer cache shortens the steps.
+EMISSION_STEPS = 4
 #: Multiple of the offset of a ray whose fraction is another random number.
 FRACTION = 1024.0
 #: Maximum optical depth per step of the packed extinction: the 16-bit format has a limited range,
@@ -136,6 +138,11 @@ class Projection:
         #: None: no step is divided
         self.substeps = None
         depth = border_depth * step
+        if irradiance is None and np.isfinite(length):
+            # The voxels of the data, which may be thick, determine the steps, not those of a cache.
+            if medium.emission is not None and medium.emission.grid is not None:
+                length /= EMISSION_STEPS
+            depth = max(depth, medium.sigma_t.maximum * length)
         if depth > SUBSTEP_DEPTH and RULES[quadrature].is_third_order and np.isfinite(length):
             count = min(2 ** int(np.ceil(np.log2(depth / SUBSTEP_DEPTH))), MOST_SUBSTEPS)
             self.substeps, length = dr.opaque(mi.Float, count), length / count

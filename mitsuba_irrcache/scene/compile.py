@@ -7,6 +7,7 @@ other scenes Mitsuba's ray tracing finds surfaces and boundaries.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -44,6 +45,9 @@ from mitsuba_irrcache.transport.path import (
 #: Offset of Mitsuba's secondary rays from a surface, over the shortest side of a medium, above
 #: which a warning is logged.
 LARGEST_OFFSET = 0.002
+#: Number of points on a surface, their largest distance from a face of the boundary of a medium
+#: over the edge of the box, and their smallest share, for which both are said to coincide.
+COINCIDENCE_POINTS, COINCIDENT, COINCIDENT_SHARE = 256, 1e-5, 0.1
 #: Minimum number of distinct single-precision coordinates within a side of a medium, and within a
 #: voxel.
 STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
@@ -94,6 +98,7 @@ def compile_scene(
         if not visible:
             _warn_that_none_is_visible(emission, reason)
         _warn_of_scale(scene, grids)
+        _warn_of_coincidence(scene, grids)
     for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
@@ -394,6 +399,37 @@ def _warn_of_scale(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
                 f"in this scene skip up to {offset:.1g}, as in volpath: the image is too dark. "
                 "Scale the scene up, or move it to the origin.",
             )
+
+
+def _warn_of_coincidence(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
+    """Log a warning if a surface lies in a face of the box that bounds a medium: which of them a
+    ray meets first is decided by rounding, and rays that cross the boundary first skip the surface.
+    """
+    rng = np.random.default_rng(COINCIDENCE_POINTS)
+    sample = mi.Point2f(np.float32(rng.random((2, COINCIDENCE_POINTS))))
+    for shape in filter(is_surface, scene.shapes()):
+        if shape.interior_medium() is not None or shape.exterior_medium() is not None:
+            continue
+        p = np.array(shape.sample_position(0.0, sample).p, dtype=np.float64)
+        for grid in grids:
+            if grid.boundary.kind != "box":
+                continue
+            inverse = np.linalg.inv(grid.frame)
+            u = inverse[:3, :3] @ p + inverse[:3, 3:]
+            for axis, face in itertools.product(range(3), (0, 1)):
+                own = np.abs(u[axis] - face) < COINCIDENT
+                across = np.delete(u[:, own], axis, axis=0)
+                if own.mean() < COINCIDENT_SHARE:
+                    continue
+                if (across.max(axis=1) > 0).all() and (across.min(axis=1) < 1).all():
+                    mi.Log(
+                        mi.LogLevel.Warn,
+                        f"irrcache: {described(shape)} lies in a face of the boundary of medium "
+                        f'"{grid.name}", and rounding decides which of them a ray meets first: '
+                        "radiance may pass the surface, also in volpath. Extend the boundary "
+                        "beyond the surface, or leave a gap of a thousandth of its size.",
+                    )
+                    break
 
 
 def _brightest(scene: mi.Scene) -> float:

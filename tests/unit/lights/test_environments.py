@@ -51,3 +51,15 @@ def test_a_single_texel_is_no_smooth_sky(value):
     bitmap = mi.Bitmap(pixels)
     scene = mi.load_dict({"type": "scene", "sky": {"type": "envmap", "bitmap": bitmap}})
     assert not is_smooth(scene.environment())
+
+
+@pytest.mark.parametrize("max_depth", [2, -1])
+@pytest.mark.filterwarnings("error")
+def test_a_black_environment_is_dark(scenes, max_depth):
+    """Mitsuba samples no direction of a black map: its directions are not a number."""
+    black = {"type": "envmap", "bitmap": mi.Bitmap(np.zeros((8, 16, 3), np.float32))}
+    assert is_smooth(mi.load_dict(black))
+    integrator = {"type": "irrcache", "solver": "sweep", "max_depth": max_depth}
+    shape = scenes.boundary(scenes.medium(np.ones((4, 4, 4)), 0.9))
+    scene = scenes.load(integrator | {"resolution": 8}, shape, emitter=black, sun=None)
+    assert not scenes.image(scene, spp=4).any()

@@ -70,3 +70,18 @@ def test_nothing_can_be_changed(scenes):
     assert other.macrocells is medium.macrocells
     denser = medium.replaced(sigma_t=type(medium.sigma_t)(np.array([9.0])))
     assert denser.macrocells is not medium.macrocells
+
+
+@pytest.mark.parametrize(("height", "expected"), [(-1.0, True), (-1.01, False), (-0.5, False)])
+def test_surfaces_in_a_face_of_the_boundary_are_named(scenes, monkeypatch, height, expected):
+    """A floor in the plane of a face, and a cube that has a face there but lies elsewhere."""
+    logged = []
+    monkeypatch.setattr(mi, "Log", lambda _, text: logged.append(text))
+    place = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], -90).scale(4)
+    floor = {"type": "rectangle", "id": "floor", "to_world": place}
+    beside = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([3, 0, 0])}
+    shape = scenes.boundary(scenes.medium(1.0, 0.5))
+    compile_scene(scenes.load({"type": "volpath"}, shape, floor=floor, beside=beside))
+    found = [text for text in logged if "lies in a face" in text]
+    assert len(found) == expected
+    assert all('"floor"' in text for text in found)
