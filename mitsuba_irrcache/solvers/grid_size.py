@@ -18,6 +18,9 @@ REQUESTED = "as requested"
 
 #: Estimated error of the pixels at the boundary of a medium [%] above which a warning is logged.
 LARGE_BORDER_ERROR = 1.0
+#: The same for meshes under suns and lamps, over the optical depth of a voxel: the irradiance of
+#: several orders of scattering has a kink at a boundary that cuts voxels.
+OBLIQUE_ERROR = 10.0
 
 #: Estimated error [%] above which the irradiance of suns and points is not interpolated.
 SMALL_BORDER_ERROR = 0.2
@@ -374,6 +377,8 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid, max_depth: int = -1) ->
     """
     depth = border_depth(medium, grid)
     error = error_at_boundary(depth, medium, max_depth)
+    if not medium.has_exact_boundary and max_depth != 2 and medium.detail is Detail.SHARP:
+        error = max(error, OBLIQUE_ERROR * depth)
     if error > LARGE_BORDER_ERROR:
         mi.Log(
             mi.LogLevel.Warn,

@@ -328,11 +328,11 @@ MUTANTS = (
         ("tests/system/test_sweep.py",),
     ),
     Mutant(
-        "radiance that enters is attenuated by a sliver of its medium (incoming radiance)",
+        "the medium behind a mask does not attenuate (incoming radiance)",
         "solvers/discrete_ordinates/boundary_condition.py",
-        "boundary.scene, boundary.other_media, ray, pointer",
-        "boundary.scene, boundary.media, ray, pointer",
-        ("tests/stress/test_stability.py",),
+        "media = boundary.other_media if boundary.surfaces is None else boundary.media",
+        "media = boundary.other_media",
+        ("tests/system/test_surfaces_among_voxels.py",),
     ),
     Mutant(
         "moments of lamps forgotten (directional sweep)",
