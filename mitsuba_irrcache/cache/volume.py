@@ -216,6 +216,27 @@ class IrradianceCache:
 
     @property
     @_consistent
+    def relative_variance(self) -> float:
+        """Mean relative variance of the voxels that is independent of their neighbours, weighted by
+        their irradiance; 0 if unknown.
+
+        Square roots are interpolated, and too small on average for large variances. Each voxel
+        contributes at most 1. It is that of the noisiest channel.
+        """
+        means, found = self._sums.irradiance(), []
+        for channel, mean in enumerate(means):
+            variance = self._sums.relative_variance(mean, channel)
+            found.append((dr.sum(mean * variance), dr.sum(mean)))
+        dr.eval(found)
+        return max(float(sum_[0]) / max(float(total[0]), 1e-30) for sum_, total in found)
+
+    @property
+    def has_own_errors(self) -> bool:
+        """Whether errors differ between neighbouring voxels."""
+        return self._sums.has_own_errors
+
+    @property
+    @_consistent
     def is_finite(self) -> bool:
         """Whether all values are finite in single precision."""
         finite = [dr.all(dr.isfinite(values)) for values in self._sums.irradiance()]

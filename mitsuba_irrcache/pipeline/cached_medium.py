@@ -49,6 +49,9 @@ from mitsuba_irrcache.solvers.grid_size import (
 )
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 
+#: Relative variance of voxels above which a warning is logged: images around a flame that few
+#: directions meet are 2 to 4 % too dark with 0.2, and 40 % with 0.7.
+LARGE_VARIANCE = 0.15
 #: Lock of the thread that writes a cache file.
 _SAVING = Lock()
 
@@ -105,6 +108,7 @@ class CachedMedium:
         self._opening: Preview | None = None
         self._preview: IrradianceCache | None = None
         self._kept_solver: Solver | None = None
+        self._has_known_noise = False
         self.cache: IrradianceCache | None = None
         #: closed form that replaces the cache; None if there is a cache, or no scattering
         self.half_space: HalfSpace | None = None
@@ -197,7 +201,24 @@ class CachedMedium:
                 "precision; "
                 "lower the radiance of the emitters, and check sigma_t and albedo."
             )
+        if not self.is_dark and self.settings.warns:
+            self._warn_of_noise()
         return True
+
+    def _warn_of_noise(self) -> None:
+        """Log a warning, once for a cache, if voxels that are sampled alone have too much noise."""
+        enough = self.cache.samples >= self.target(self.settings.samples)
+        if self._has_known_noise or not enough or not self.cache.has_own_errors:
+            return
+        self._has_known_noise = True
+        variance = self.cache.relative_variance
+        if variance > LARGE_VARIANCE:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"irrcache: {self.label}the irradiance of single voxels has a noise of "
+                f"{100 * np.sqrt(variance):.0f} %, because few samples meet what emits: the image "
+                f"is too dark where it is scattered. Raise cache_spp (now {self.cache.samples}).",
+            )
 
     def close(self) -> bool:
         """Discard incomplete batches; return whether there were any."""
@@ -207,6 +228,7 @@ class CachedMedium:
 
     def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
         """Load the cache from its file if it exists; otherwise create an empty one."""
+        self._has_known_noise = False
         settings, medium, solver = self.settings, self.medium, self.solver
         grid, basis = self.grid, self._basis
         if settings.warns:

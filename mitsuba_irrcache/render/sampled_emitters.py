@@ -9,6 +9,7 @@ import numpy as np
 from mitsuba_irrcache.core.sequences import kronecker
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
+from mitsuba_irrcache.transport.path import with_valid_direction
 
 #: Luminance over its mean from which on a direction of an environment counts as a peak, which
 #: casts shadows; samples of such an environment at each vertex.
@@ -74,6 +75,7 @@ class SampledEmitters:
         first = dr.gather(mi.Float, self._first, number, active)
         u = mi.Point2f(u.x, first + u.y * dr.gather(mi.Float, self._share, number, active))
         record, value = emitter.sample_direction(vertex, u, active)
+        record = with_valid_direction(record)
         return record, value * share * self.excess(emitter, value * record.pdf)
 
 

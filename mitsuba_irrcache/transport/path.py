@@ -193,7 +193,8 @@ def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
     Power heuristic of multiple importance sampling (Veach and Guibas 1995).
     """
     # docs/primer, eq. (3.2)
-    a, b = dr.square(a), dr.square(b)
+    a = dr.square(a)
+    b = dr.select(b > 0, dr.square(b), 0)  # a black environment map has no density: 0 / 0
     return dr.select(a > 0, a / (a + b), 0)
 
 
@@ -279,6 +280,14 @@ def trace_to_infinity(
     return dr.select(escaped, attenuation, 0), radiance, rng
 
 
+def with_valid_direction(record: mi.DirectionSample3f) -> mi.DirectionSample3f:
+    """Return a sample of an emitter with any direction where there is none: in Mitsuba that from a
+    black environment map is not a number, and remains so when it is multiplied by 0.
+    """
+    record.d = dr.select(record.pdf > 0, record.d, mi.Vector3f(0, 0, 1))
+    return record
+
+
 def sample_emitter(
     scene: mi.Scene,
     media: Media,
@@ -294,6 +303,7 @@ def sample_emitter(
     number generator.
     """
     record, radiance = scene.sample_emitter_direction(vertex, sample, False, active)
+    record = with_valid_direction(record)
     active_em = active & (record.pdf > 0) & (dr.max(radiance) > 0)
     attenuation, rng = visibility(scene, media, vertex, record.p, pointer, rng, active_em)
     return record, dr.select(active_em, radiance * attenuation, 0), rng

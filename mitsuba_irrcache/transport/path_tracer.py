@@ -27,6 +27,7 @@ from mitsuba_irrcache.transport.path import (
     power_heuristic,
     sample_bsdf,
     visibility,
+    with_valid_direction,
 )
 
 
@@ -258,6 +259,7 @@ class PathTracer:
         active = (collided | smooth) & (path.depth + 1 < self._max_depth)
         sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
         record, emitted = self.scene.sample_emitter_direction(vertex, sample, False, active)
+        record = with_valid_direction(record)
         active &= (record.pdf > 0) & (dr.max(emitted) > 0)
         value, density = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(record.d), active & smooth)
         value = dr.select(collided, mi.Spectrum(dr.inv_four_pi), value)

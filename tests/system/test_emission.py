@@ -303,6 +303,20 @@ def test_a_small_flame_illuminates_far_voxels(scenes, edge):
     assert ratio.std() < 0.05
 
 
+@pytest.mark.parametrize(("edge", "warns"), [(2, True), (24, False)])
+def test_noise_of_a_small_flame_is_warned_of(scenes, monkeypatch, edge, warns):
+    """The paths of the solver `path` rarely meet a small flame: images around it are too dark."""
+    logged = []
+    monkeypatch.setattr(mi, "Log", lambda _, text: logged.append(text))
+    values, centre = np.zeros((32,) * 3), slice(16 - edge // 2, 16 + edge // 2)
+    values[centre, centre, centre] = 50
+    place = scenes.placement()
+    shape = scenes.boundary(scenes.medium(0.5, 0.8, place), place)
+    settings = {"solver": "path", "max_depth": 2, "resolution": 12}
+    prepare(scenes, shape, scenes.volume(values, place), **settings)
+    assert any("Raise cache_spp" in text for text in logged) is warns
+
+
 @pytest.mark.parametrize("density", [0.0, 12.0])
 def test_emission_of_coarse_data_is_resolved(scenes, density):
     """Without scattering there is no cache whose voxels shorten the steps of the ray march: in

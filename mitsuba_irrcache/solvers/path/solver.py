@@ -32,7 +32,7 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask, register
 from mitsuba_irrcache.solvers.grid_size import SizeAmongSurfaces, SizeRule
 from mitsuba_irrcache.solvers.path import estimator as volume_path
-from mitsuba_irrcache.transport.path import Media
+from mitsuba_irrcache.transport.path import Media, with_valid_direction
 from mitsuba_irrcache.transport.path_tracer import PathTracer
 from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 
@@ -424,6 +424,7 @@ def direct_light(
         sample = mi.Point2f(scaled - mi.Float(number), sample.y)
         record, radiance = emitter.sample_direction(interaction, sample, active)
         radiance = radiance * count
+    record = with_valid_direction(record)
     contributes = active & (record.pdf > 0) & (dr.max(radiance) > 0)
     ray = mi.Ray3f(position, record.d)
     hit, near, far = medium.intersect(ray)

@@ -53,13 +53,21 @@ def test_a_single_texel_is_no_smooth_sky(value):
     assert not is_smooth(scene.environment())
 
 
-@pytest.mark.parametrize("max_depth", [2, -1])
+@pytest.mark.parametrize("solver", ["sweep", "path"])
+@pytest.mark.parametrize(("max_depth", "g", "on_ground"), [(2, 0, 0), (-1, 0.4, 0), (-1, 0, 1)])
 @pytest.mark.filterwarnings("error")
-def test_a_black_environment_is_dark(scenes, max_depth):
-    """Mitsuba samples no direction of a black map: its directions are not a number."""
+def test_a_black_environment_is_dark(scenes, solver, max_depth, g, on_ground):
+    """Mitsuba samples no direction of a black map: its directions and densities are not a number,
+    also after they are multiplied by 0.
+    """
     black = {"type": "envmap", "bitmap": mi.Bitmap(np.zeros((8, 16, 3), np.float32))}
     assert is_smooth(mi.load_dict(black))
-    integrator = {"type": "irrcache", "solver": "sweep", "max_depth": max_depth}
-    shape = scenes.boundary(scenes.medium(np.ones((4, 4, 4)), 0.9))
-    scene = scenes.load(integrator | {"resolution": 8}, shape, emitter=black, sun=None)
-    assert not scenes.image(scene, spp=4).any()
+    integrator = {"type": "irrcache", "solver": solver, "max_depth": max_depth, "cache_spp": 16}
+    matter = scenes.medium(np.ones((4, 4, 4)), 0.9)
+    matter |= {"phase": {"type": "hg", "g": g}} if g else {}
+    floor = mi.ScalarTransform4f().translate([0, -1.5, 0]).rotate([1, 0, 0], -90).scale(4)
+    objects = {"floor": {"type": "rectangle", "to_world": floor}} if on_ground else {}
+    objects |= {"emitter": black, "sun": None}
+    scene = scenes.load(integrator | {"resolution": 8}, scenes.boundary(matter), **objects)
+    image = scenes.image(scene, spp=4)
+    assert np.isfinite(image).all() and not image.any()
