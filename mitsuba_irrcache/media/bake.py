@@ -198,6 +198,7 @@ def volume_error(name: str) -> UnsupportedSceneError:
     return UnsupportedSceneError(
         f"irrcache: {name} does not interpolate as expected. Only trilinear, clamped volumes are "
         'supported: use filter_type "trilinear" and wrap_mode "clamp", or render with "volpath". '
+        "A rotation in its to_world needs an axis of length 1, which Mitsuba does not normalise. "
         "If its data were edited in place, as through a NumPy view, Mitsuba still evaluates a copy "
         'of the old data: call params.set_dirty("....data") with their key, and params.update().'
     )

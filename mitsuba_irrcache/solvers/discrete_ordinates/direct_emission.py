@@ -26,7 +26,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.tracking import free_flight, medium_transmittance
 
 #: Distance at which both parts are equal, over half the edge of a cube of the emissive volume.
-NEAR = 0.25
+NEAR = 0.5
 
 
 class EmissionPoints:
@@ -108,7 +108,7 @@ def emission_irradiance(
     """
     place = dr.arange(mi.UInt32, dr.width(position))
     rng = random_stream(mi.sample_tea_32(place, hashed_seed(seed)[0]), 1)
-    shift = [rng.next_uint32(), rng.next_uint32()]
+    shift = [rng.next_uint32() for _ in range(3)]
     count = dr.opaque(mi.UInt32, count)
     if points is None:
         total = _along_directions(medium, position, count, shift, rng, angular_basis)
@@ -123,7 +123,8 @@ def _along_directions(medium, position, count, shift, rng, angular_basis):
     """Sample collisions along random directions; emission is integrated up to them."""
     total, weight, k = empty_sums(angular_basis), 4 * dr.pi / mi.Float(count), mi.UInt32(0)
     while dr.hint(k < count, label="emission"):
-        ray = mi.Ray3f(position, _direction(shift, k))
+        sample = mi.Point2f(unit_floats(kronecker_words(k, shift[:2])))
+        ray = mi.Ray3f(position, mi.warp.square_to_uniform_sphere(sample))
         hit, near, far = medium.intersect(ray)
         *_, rng, emitted = free_flight(
             medium, ray, dr.maximum(near, 0), far, mi.Spectrum(1), rng, hit
@@ -143,12 +144,13 @@ def _in_both_parts(medium, points, position, count, shift, rng, angular_basis):
     total, weight, k = empty_sums(angular_basis), 1 / mi.Float(count), mi.UInt32(0)
     while dr.hint(k < count, label="emission"):
         # The density of places along a ray is proportional to 1 / (t^2 + scale^2).
-        ray = mi.Ray3f(position, _direction(shift, k))
+        x, y, place = unit_floats(kronecker_words(k, shift))
+        ray = mi.Ray3f(position, mi.warp.square_to_uniform_sphere(mi.Point2f(x, y)))
         hit, near, far = medium.intersect(ray)
         begin, end = emission.interval(ray, dr.maximum(near, 0), far)
         seen = hit & (begin < end)
         low, high = dr.atan(begin / scale), dr.atan(end / scale)
-        t = scale * dr.tan(dr.lerp(low, high, rng.next_float32()))
+        t = scale * dr.tan(dr.lerp(low, high, place))
         t = dr.select(seen, dr.clip(t, begin, end), 0)
         j = mi.Spectrum(emission.at_world(ray(t), seen))
         share = split / dr.fma(channel_mean(j), dr.square(t), split)
@@ -157,7 +159,7 @@ def _in_both_parts(medium, points, position, count, shift, rng, angular_basis):
         part = dr.select(seen, j * passed * (4 * dr.pi * weight * share * length), 0)
         total = with_radiance(total, position, ray.d, mi.Spectrum(0), part, angular_basis)
 
-        p, rng = points.sample(unit_floats(kronecker_words(k, shift)), rng)
+        p, rng = points.sample([x, y], rng)
         offset = p - position
         square = dr.squared_norm(offset)
         distance = dr.sqrt(square)
@@ -171,8 +173,3 @@ def _in_both_parts(medium, points, position, count, shift, rng, angular_basis):
         total = with_radiance(total, position, direction, mi.Spectrum(0), part, angular_basis)
         k += 1
     return total
-
-
-def _direction(shift: list[mi.UInt32], k: mi.UInt32) -> mi.Vector3f:
-    """Return direction ``k`` of the sequence with this random shift."""
-    return mi.warp.square_to_uniform_sphere(mi.Point2f(unit_floats(kronecker_words(k, shift))))
