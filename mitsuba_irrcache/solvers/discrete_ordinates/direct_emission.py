@@ -26,7 +26,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.tracking import free_flight, medium_transmittance
 
 #: Distance at which both parts are equal, over half the edge of a cube of the emissive volume.
-NEAR = 0.5
+NEAR = 0.35
 
 
 class EmissionPoints:
