@@ -48,6 +48,8 @@ LARGEST_OFFSET = 0.002
 #: Number of points on a surface, their largest distance from a face of the boundary of a medium
 #: over the edge of the box, and their smallest share, for which both are said to coincide.
 COINCIDENCE_POINTS, COINCIDENT, COINCIDENT_SHARE = 256, 1e-5, 0.1
+#: Shapes with flat parts, besides meshes; others, such as instances, need not sample positions.
+FLAT = ("Rectangle", "Disk")
 #: Minimum number of distinct single-precision coordinates within a side of a medium, and within a
 #: voxel.
 STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
@@ -408,11 +410,12 @@ def _warn_of_coincidence(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
     rng = np.random.default_rng(COINCIDENCE_POINTS)
     sample = mi.Point2f(np.float32(rng.random((2, COINCIDENCE_POINTS))))
     for shape in filter(is_surface, scene.shapes()):
-        if shape.interior_medium() is not None or shape.exterior_medium() is not None:
+        may_be_flat = shape.is_mesh() or shape.class_name() in FLAT
+        if not may_be_flat or shape.interior_medium() or shape.exterior_medium():
             continue
         p = np.array(shape.sample_position(0.0, sample).p, dtype=np.float64)
         for grid in grids:
-            if grid.boundary.kind != "box":
+            if grid.boundary.kind != "box" or not grid.has_exact_boundary:
                 continue
             inverse = np.linalg.inv(grid.frame)
             u = inverse[:3, :3] @ p + inverse[:3, 3:]

@@ -85,3 +85,20 @@ def test_surfaces_in_a_face_of_the_boundary_are_named(scenes, monkeypatch, heigh
     found = [text for text in logged if "lies in a face" in text]
     assert len(found) == expected
     assert all('"floor"' in text for text in found)
+
+
+def test_shapes_without_sampled_positions_are_described(scenes):
+    """Mitsuba samples no positions on instances and signed distance fields."""
+    beside = mi.ScalarTransform4f().translate([3, 0, 0])
+    values = np.linspace(-0.5, 0.5, 64, dtype=np.float32).reshape(4, 4, 4, 1)
+    objects = {
+        "group": {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.4}},
+        "copy": {
+            "type": "instance",
+            "group": {"type": "ref", "id": "group"},
+            "to_world": beside,
+        },
+        "field": {"type": "sdfgrid", "grid": mi.TensorXf(values), "to_world": beside},
+    }
+    scene = scenes.load({"type": "volpath"}, scenes.boundary(scenes.medium(1.0, 0.5)), **objects)
+    assert len(compile_scene(scene).visible) == 1
