@@ -129,13 +129,9 @@ def _restored(description: dict, arrays: dict[str, np.ndarray]) -> StoredCache:
     if digest_of_arrays(arrays) != description["values"]:
         raise ValueError("its values are not those that were saved")
     sums = BatchSums(active.size, channels, batch, count, correlated)
-    sums = sums.filled(
-        streams,
-        *(
-            _known(values, sums.real if values is totals or values is spreads else mi.Float)
-            for values in (totals, spreads, moments, own)
-        ),
-    )
+    real = sums.real
+    kinds = (totals, real), (spreads, real), (moments, mi.Float), (own, mi.Float)
+    sums = sums.filled(streams, *(_known(values, kind) for values, kind in kinds))
     max_depth, fingerprint = int(description["max_depth"]), dict(description["fingerprint"])
     return StoredCache(grid, mi.UInt32(active), max_depth, fingerprint, sums)
 

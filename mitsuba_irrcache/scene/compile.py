@@ -415,24 +415,31 @@ def _warn_of_coincidence(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
             continue
         p = np.array(shape.sample_position(0.0, sample).p, dtype=np.float64)
         for grid in grids:
-            if grid.boundary.kind != "box" or not grid.has_exact_boundary:
-                continue
-            inverse = np.linalg.inv(grid.frame)
-            u = inverse[:3, :3] @ p + inverse[:3, 3:]
-            for axis, face in itertools.product(range(3), (0, 1)):
-                own = np.abs(u[axis] - face) < COINCIDENT
-                across = np.delete(u[:, own], axis, axis=0)
-                if own.mean() < COINCIDENT_SHARE:
-                    continue
-                if (across.max(axis=1) > 0).all() and (across.min(axis=1) < 1).all():
-                    mi.Log(
-                        mi.LogLevel.Warn,
-                        f"irrcache: {described(shape)} lies in a face of the boundary of medium "
-                        f'"{grid.name}", and rounding decides which of them a ray meets first: '
-                        "radiance may pass the surface, also in volpath. Extend the boundary "
-                        "beyond the surface, or leave a gap of a thousandth of its size.",
-                    )
-                    break
+            is_box = grid.boundary.kind == "box" and grid.has_exact_boundary
+            if is_box and _lie_in_a_face(p, grid.frame):
+                mi.Log(
+                    mi.LogLevel.Warn,
+                    f"irrcache: {described(shape)} lies in a face of the boundary of medium "
+                    f'"{grid.name}", and rounding decides which of them a ray meets first: '
+                    "radiance may pass the surface, also in volpath. Extend the boundary "
+                    "beyond the surface, or leave a gap of a thousandth of its size.",
+                )
+
+
+def _lie_in_a_face(p: np.ndarray, frame: np.ndarray) -> bool:
+    """Return whether a share of the points ``p`` (3, n) of a surface lies in the plane of a face of
+    the unit cube mapped by ``frame``, and their bounds overlap the face.
+    """
+    inverse = np.linalg.inv(frame)
+    u = inverse[:3, :3] @ p + inverse[:3, 3:]
+    for axis, face in itertools.product(range(3), (0, 1)):
+        own = np.abs(u[axis] - face) < COINCIDENT
+        if own.mean() < COINCIDENT_SHARE:
+            continue
+        across = np.delete(u[:, own], axis, axis=0)
+        if (across.max(axis=1) > 0).all() and (across.min(axis=1) < 1).all():
+            return True
+    return False
 
 
 def _brightest(scene: mi.Scene) -> float:

@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.statistics import ORDER_GROUPS
+from mitsuba_irrcache.cache.statistics import ORDER_GROUPS, totals_of_pairs
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.occupancy import occupied_box
@@ -149,9 +149,11 @@ class Sweep:
         self._direct: list[list[mi.Spectrum]] = []
         self._emission: list[list[mi.Spectrum]] = []
         self._emission_points: EmissionPoints | None = None
+        if medium.emission is not None and medium.emission.grid is not None:
+            self._emission_points = EmissionPoints(medium.emission)
         #: for each channel, the sum of the variances of what is sampled voxel by voxel in a batch;
         #: None: nothing
-        self._own_spreads: list[mi.Float] | None = None
+        self._own_spreads: list[mi.Float | None] = [None] * cache.channels
         #: irradiance of suns that are direct lights of the cache
         self._sun_irradiance: list[mi.Spectrum] = []
         #: factors of the channels of a batch's results
@@ -275,10 +277,8 @@ class Sweep:
         moments if any.
         """
         cache, seed = self.cache, (self.seed, number)
-        self._own_spreads = None
+        self._own_spreads = [None] * cache.channels
         if self._medium.emission is not None:
-            if self._emission_points is None and self._medium.emission.grid is not None:
-                self._emission_points = EmissionPoints(self._medium.emission)
             arguments = self._medium, self._emission_points, self._sample_points, cache.batch // 2
             self._emission = [
                 self._mean_of_two(
@@ -351,9 +351,7 @@ class Sweep:
         cache_seed, number = seed
         first, second = (estimate((cache_seed, 2 * number + half)) for half in (0, 1))
         variances = [dr.square(0.5 * (a - b)) for a, b in zip(first[0], second[0], strict=True)]
-        if self._own_spreads is not None:
-            variances = [a + b for a, b in zip(self._own_spreads, variances, strict=True)]
-        self._own_spreads = variances
+        self._own_spreads = totals_of_pairs(self._own_spreads, variances)
         mean = [0.5 * (a + b) for a, b in zip(first, second, strict=True)]
         dr.eval(mean, self._own_spreads)
         return mean
