@@ -29,6 +29,8 @@ from tests.support.scenes import (
 
 shorten_compilation()
 # Idle threads of Dr.Jit wait actively: more of them than cores take a quarter of the time.
+#: Dr.Jit backend of the variants under test: "llvm" or "cuda".
+BACKEND = os.environ.get("IRRCACHE_TEST_BACKEND", "llvm")
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 THREADS = max(1, (os.cpu_count() or 1) // WORKERS)
 
@@ -71,9 +73,9 @@ def pytest_runtest_teardown(item, nextitem):
 
 @pytest.fixture
 def rgb(request):
-    """Select the variant ``llvm_ad_rgb`` and silence the log."""
+    """Select the variant ``llvm_ad_rgb`` (or ``cuda_ad_rgb``) and silence the log."""
     if "mono" not in request.fixturenames:
-        _set_variant("llvm_ad_rgb")
+        _set_variant(f"{BACKEND}_ad_rgb")
 
 
 @pytest.fixture
@@ -81,10 +83,10 @@ def mono(request):
     """Select the variant ``llvm_ad_mono`` for one test, and leave it to the next one if that
     selects it, too: each change takes a tenth of a second.
     """
-    _set_variant("llvm_ad_mono")
+    _set_variant(f"{BACKEND}_ad_mono")
     yield
     if "mono" not in request.node.next_fixtures:
-        _set_variant("llvm_ad_rgb")
+        _set_variant(f"{BACKEND}_ad_rgb")
 
 
 def _set_variant(name: str) -> None:

@@ -47,8 +47,10 @@ class Aureole:
         extents = MAX_EXTENT * np.linspace(0, 1, EXTENTS)
         table = scale * _differences(moments, angles, depths, np.square(extents))
         table = table.astype(np.float32)
-        self._wide = mi.Texture3f(mi.TensorXf(table[..., None]), wrap_mode=dr.WrapMode.Clamp)
-        self._narrow = mi.Texture2f(mi.TensorXf(table[0][..., None]), wrap_mode=dr.WrapMode.Clamp)
+        # GPUs' texture units interpolate with weights of 8 bits: too coarse for angles this small.
+        options = {"use_accel": False, "wrap_mode": dr.WrapMode.Clamp}
+        self._wide = mi.Texture3f(mi.TensorXf(table[..., None]), **options)
+        self._narrow = mi.Texture2f(mi.TensorXf(table[0][..., None]), **options)
 
     def correction(
         self,
