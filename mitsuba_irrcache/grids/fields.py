@@ -80,3 +80,29 @@ class GridField:
 
 
 Field = ConstantField | GridField
+
+
+#: Rounding of the voxel coordinates by the texture units of GPUs, whose weights have 8 bits, with a
+#: margin of 2.
+ROUNDED = 1 / 256
+
+
+def error_of_texture_units(field: Field, p: mi.Point3f) -> mi.Float | mi.Color3f:
+    """Bound the error at world positions ``p`` of a GPU's texture units, by which Mitsuba
+    interpolates grid volumes in ``cuda_*`` variants; 0 in others.
+    """
+    if field.grid is None or dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
+        return mi.Float(0)
+    return change_within(field, field.grid.coordinates.point(p), ROUNDED)
+
+
+def change_within(field: GridField, u: mi.Point3f, distance: float) -> mi.Float | mi.Color3f:
+    """Sum over the axes how much a field changes within a ``distance`` of voxel coordinates."""
+    value = field.at(u)
+    result = dr.zeros(type(value))
+    for axis in range(3):
+        offset = mi.Vector3f([distance if i == axis else 0.0 for i in range(3)])
+        result += dr.maximum(
+            dr.abs(field.at(u + offset) - value), dr.abs(field.at(u - offset) - value)
+        )
+    return result
