@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.fast_math import clipped
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 
 #: Number of bits of the largest sum of magnitudes.
@@ -35,7 +36,16 @@ class FixedPointSums:
         self._scale = dr.opaque(mi.Float, 2.0**self._exponent)
         self._limit = dr.opaque(mi.Float, 2.0**BITS)
         self.sums = dr.zeros(mi.Int64, size)
-        dr.make_opaque(self.sums)
+        self._invalid = dr.zeros(mi.UInt32, 1)
+        dr.make_opaque(self.sums, self._invalid)
+
+    def check(self, values: Sequence[mi.Float], active: mi.Bool) -> None:
+        """Note values that are not finite, which fixed point cannot represent."""
+        finite = mi.Bool(True)
+        for value in values:
+            finite &= dr.isfinite(value)
+        one, first = mi.UInt32(1), mi.UInt32(0)
+        dr.scatter_reduce(dr.ReduceOp.Or, self._invalid, one, first, active & ~finite)
 
     def add(self, index: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
         """Add a ``value`` to the sum at ``index``."""
@@ -47,7 +57,12 @@ class FixedPointSums:
         dr.scatter_reduce(dr.ReduceOp.Add, self.sums, mi.Int64(scaled), index, active, mode)
 
     def values(self) -> mi.Float:
-        """Return the sums."""
+        """Return the sums; raise IrrcacheError if a value that `check` saw was not finite."""
+        if self._invalid[0]:
+            raise IrrcacheError(
+                "irrcache: a contribution to the gradient is not finite. This is an error of "
+                "irrcache: please report it with the scene. No gradient was written."
+            )
         double = dr.float64_array_t(mi.Float)
         result = mi.Float(double(self.sums) * dr.opaque(double, 2.0**-self._exponent))
         dr.eval(result)
@@ -63,6 +78,7 @@ class GridSplat:
 
     def add(self, p: mi.Point3f, values: Sequence[mi.Float], active: mi.Bool) -> None:
         """Add one value for each channel at world positions."""
+        self._sums.check(values, active)
         for index, weight in self.grid.corners(self.grid.coordinates.point(p)):
             for c, value in enumerate(values):
                 place = index * self.channels + c
@@ -81,6 +97,7 @@ class VoxelSums:
 
     def add(self, p: mi.Point3f, values: Sequence[mi.Float], active: mi.Bool) -> None:
         """Add one value for each channel to the voxels around world positions."""
+        self._sums.check(values, active)
         place = [
             dr.clip(mi.Int32(dr.floor(clipped(x, -1.0, mi.Float(n)))), 0, n - 1)
             for x, n in zip(self.grid.coordinates.point(p), self.grid.sides, strict=True)
@@ -107,6 +124,7 @@ class ConstantSplat:
 
     def add(self, p: mi.Point3f, values: Sequence[mi.Float], active: mi.Bool) -> None:
         """Add one value for each channel, wherever ``p`` is."""
+        self._sums.check(values, active)
         bits = sum(dr.reinterpret_array(mi.UInt32, x) * 2654435761 for x in p)
         slot = bits >> (32 - SLOTS.bit_length() + 1)
         for c, value in enumerate(values):

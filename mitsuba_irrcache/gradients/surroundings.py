@@ -332,7 +332,8 @@ class Surroundings:
         within = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
         origin = grid.world.point(mi.Point3f(*grid.voxel_indices(voxel)) + within)
         direction = mi.warp.square_to_uniform_sphere(mi.Point2f(s, t))
-        share = dr.rcp(chance * count)
+        # Rounding of the cumulative sum can select a voxel of no worth: 0 / 0.
+        share = dr.select(chance > 0, dr.rcp(chance * count), 0)
         values = [dr.gather(mi.Float, own, voxel) * share for own in worth]
         irradiance = mi.Spectrum(*values)
         dr.eval(origin, direction, irradiance, rng)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -97,12 +99,9 @@ def error_of_texture_units(field: Field, p: mi.Point3f) -> mi.Float | mi.Color3f
 
 
 def change_within(field: GridField, u: mi.Point3f, distance: float) -> mi.Float | mi.Color3f:
-    """Sum over the axes how much a field changes within a ``distance`` of voxel coordinates."""
+    """Return how much a field changes within a ``distance`` of voxel coordinates along all axes."""
     value = field.at(u)
     result = dr.zeros(type(value))
-    for axis in range(3):
-        offset = mi.Vector3f([distance if i == axis else 0.0 for i in range(3)])
-        result += dr.maximum(
-            dr.abs(field.at(u + offset) - value), dr.abs(field.at(u - offset) - value)
-        )
+    for signs in product((-distance, distance), repeat=3):
+        result = dr.maximum(result, dr.abs(field.at(u + mi.Vector3f(signs)) - value))
     return result

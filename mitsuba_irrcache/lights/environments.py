@@ -42,6 +42,9 @@ def is_smooth(environment: mi.Emitter) -> bool:
     """Return whether the maximum radiance of an environment is at most `SMOOTH_CONTRAST` times its
     mean, in every channel.
     """
+    texels = mi.traverse(environment).get("data")
+    if texels is not None and not dr.all(dr.isfinite(texels.array)):
+        return False
     _, even = _even_radiance(environment)
     points = mi.Point2f(np.float32(lattice_points(SAMPLES, GOLDEN_STEP)))
     record, _ = environment.sample_direction(dr.zeros(mi.Interaction3f, SAMPLES), points)
@@ -50,7 +53,7 @@ def is_smooth(environment: mi.Emitter) -> bool:
         towards = np.where(np.isfinite(towards), towards, [[0], [0], [1]])
     sampled = environment_radiance(environment, -towards.T)
     brightest = np.maximum(even.max(axis=0), sampled.max(axis=0))
-    return bool((brightest <= SMOOTH_CONTRAST * even.mean(axis=0)).all())  # False with NaN
+    return bool((brightest <= SMOOTH_CONTRAST * even.mean(axis=0)).all())
 
 
 def exceeds_even_ordinates(environment: mi.Emitter) -> bool:

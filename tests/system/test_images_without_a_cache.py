@@ -39,7 +39,8 @@ def loaded(scenes, objects: dict, size: int = 16, **properties) -> mi.Scene:
 
 def test_a_small_image_of_milk_in_a_tumbler(scenes):
     """The image is that of volpath, with the samples that an error of 1 % needs; the sampler keeps
-    its own number. The same call gives the same image.
+    its own number. The same call gives the same image, but for the order in which GPUs add
+    samples.
     """
     scene = loaded(scenes, tumbler())
     integrator = scene.integrator()
@@ -50,7 +51,8 @@ def test_a_small_image_of_milk_in_a_tumbler(scenes):
     stock = scenes.load({"type": "volpath", "rr_depth": 50}, None, 16, **tumbler())
     error = np.sqrt(np.square(image - scenes.image(stock, spp=1024)).mean()) / image.mean()
     assert 0.002 < error < 0.012
-    np.testing.assert_array_equal(image, scenes.image(loaded(scenes, tumbler()), spp=4))
+    again = scenes.image(loaded(scenes, tumbler()), spp=4)
+    np.testing.assert_allclose(again, image, rtol=0 if mi.variant().startswith("llvm") else 1e-6)
 
 
 def test_after_several_images_a_cache_is_faster(scenes):

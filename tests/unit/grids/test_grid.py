@@ -56,7 +56,7 @@ def test_lookup_is_gridvolumes(scenes, placement, channels, shape):
     """
     to_world = scenes.placement(**placement)
     values = scenes.texture((*shape, channels), 0, 2, 3)
-    volume = mi.load_dict(scenes.volume(values, to_world))
+    volume = mi.load_dict(scenes.volume(values, to_world, accel=False))
     grid = Grid(shape, to_world)
     field = GridField(grid, mi.Float(values.ravel()), channels, scale=1.5)
     u = np.random.default_rng(2).uniform(0.01, 0.99, (3, 512)) * grid.resolution[:, None]
@@ -84,7 +84,6 @@ def test_near_cubic(edges, resolution):
 
     Edges differ by no more than the rounding of a count.
     """
-    mi.set_variant("llvm_ad_rgb")
     grid = Grid.near_cubic(np.diag([*edges, 1.0]), resolution)
     counts = grid.resolution
     assert counts.max() == resolution

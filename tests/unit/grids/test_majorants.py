@@ -37,7 +37,6 @@ def cells_of(shape, channels, seed, sparse=False):
 @settings(max_examples=40, deadline=None)
 def test_bounds_hold_everywhere(shape, channels, sparse, seed):
     """Majorants bound the extinction at random points, on cell walls and outside, per channel."""
-    mi.set_variant("llvm_ad_rgb")
     field, cells = cells_of(shape, channels, seed, sparse)
     rng = np.random.default_rng(seed + 1)
     p = rng.uniform(-0.5, 1.5, (3, 2000))
@@ -64,7 +63,6 @@ def test_bounds_are_tight():
 @settings(max_examples=20, deadline=None)
 def test_traversal_visits_the_cell_of_every_point(seed):
     """Each point of a ray lies in the cell that the traversal visits between its entry and exit."""
-    mi.set_variant("llvm_ad_rgb")
     _, cells = cells_of((9, 13, 11), 1, 5)
     rng = np.random.default_rng(seed)
     count = 256

@@ -19,9 +19,16 @@ def baked(scenes, medium, to_world=None, kind="cube"):
 
 
 def mitsubas(medium: dict, p: mi.Point3f) -> tuple[np.ndarray, np.ndarray]:
+    exact = {
+        key: medium[key] | {"accel": False}
+        for key in ("sigma_t", "albedo")
+        if medium[key]["type"] == "gridvolume"
+    }
     interaction = mi.MediumInteraction3f()
     interaction.p = p
-    sigma_s, _, sigma_t = mi.load_dict(medium).get_scattering_coefficients(interaction, True)
+    sigma_s, _, sigma_t = mi.load_dict(medium | exact).get_scattering_coefficients(
+        interaction, True
+    )
     return np.array(sigma_t), np.array(sigma_s)
 
 
