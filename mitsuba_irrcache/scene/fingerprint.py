@@ -38,7 +38,8 @@ class SceneVersion:
     operations that write to such an array (``dr.scatter``, ``params[key][i] = x``) write to a copy
     with another index.
 
-    Only writes through a NumPy view of an array keep its index. Therefore the contents of small
+    Only writes through a NumPy view of an array (on a GPU, one of another library) keep its index.
+    Therefore the contents of small
     arrays are compared too, and a few thousand values of larger ones. Code that edits a large array
     through a view has to call ``params.set_dirty``, which Mitsuba requires as well.
 
@@ -118,18 +119,33 @@ class _Kept:
         self.index, self._kind, self._width = array.index, type(array), dr.width(array)
         self._view = self._bytes = None
         self._whole = False
-        if array.state == dr.VarState.Literal or dr.backend_v(array) != dr.JitBackend.LLVM:
-            return  # no memory that could be written to; on a GPU reading it would take time
-        view = array.numpy()
-        self._whole = view.nbytes <= min(SMALL, budget.left)
-        self._view = view if self._whole else view[:: view.size // SAMPLED + 1]
-        self._bytes = self._view.tobytes()
-        budget.left -= view.nbytes if self._whole else 0
+        if array.state == dr.VarState.Literal:
+            return  # no memory that could be written to
+        size = dr.itemsize_v(array) * self._width
+        self._whole = size <= min(SMALL, budget.left)
+        budget.left -= size if self._whole else 0
+        if dr.backend_v(array) == dr.JitBackend.LLVM:
+            view = array.numpy()
+            self._view = view if self._whole else view[:: self._stride]
+        self._bytes = self._read()
+
+    @property
+    def _stride(self) -> int:
+        return self._width // SAMPLED + 1
+
+    def _read(self) -> bytes:
+        """Read the values that are compared; those of GPUs are copied at each call."""
+        if self._view is not None:
+            return self._view.tobytes()
+        if self._whole:
+            return self._array.numpy().tobytes()
+        place = dr.arange(mi.UInt32, -(-self._width // self._stride)) * self._stride
+        return dr.gather(self._kind, self._array, place).numpy().tobytes()
 
     @property
     def is_intact(self) -> bool:
         """Whether the memory of the array is unchanged, as far as it is compared."""
-        return self._view is None or self._view.tobytes() == self._bytes
+        return self._bytes is None or self._read() == self._bytes
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, _Kept) or self._kind is not other._kind:
