@@ -175,7 +175,12 @@ class AreaLight(DirectLight):
         self, depth: mi.Float | mi.Color3f, sigma_t: mi.Float | mi.Color3f
     ) -> mi.Float | mi.Color3f:
         if self._lines != EACH:
-            return super()._mean_extinction(depth, sigma_t)
+            mean = super()._mean_extinction(depth, sigma_t)
+            if self._solid_angle.is_flat:
+                return mean
+            # Lookups outside of an opaque shape interpolate with voxels whose centre is inside.
+            is_inside = self._solid_angle.at(self._centres) <= 0
+            return dr.select(is_inside, sigma_t, mean)
         count = dr.opaque(mi.UInt32, self.points_per_voxel)
         rng = self._stream_of_voxels()
         shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
@@ -442,8 +447,9 @@ class AreaLight(DirectLight):
         """Sample a point on the emitter, approximately uniformly by solid angle.
 
         ``shares`` is the result of `SolidAngle.shares`. Returns the point, its direction and
-        distance, and the solid angle that it represents, up to a constant factor. Flat emitters
-        are sampled from both sides, so that the factors are continuous across their plane.
+        distance, and the solid angle that it represents, up to a constant factor; 0 if it is not
+        seen, from inside of a closed shape. Flat emitters are sampled from both sides, so that the
+        factors are continuous across their plane.
         """
         sample = mi.Point2f(kronecker(k, 2, (shift.x, shift.y)))
         if self._solid_angle.kind == "sphere":
@@ -452,7 +458,8 @@ class AreaLight(DirectLight):
             weight = dr.select(seen, dr.rcp(record.pdf) + SMALL_ANGLE, 0)
             return record.p, record.d, record.dist, weight
         direction, distance, angle = self._solid_angle.sample(vertex.p, shares, sample)
-        return vertex.p + distance * direction, direction, distance, angle + SMALL_ANGLE
+        weight = dr.select(sum(shares) > 0, angle + SMALL_ANGLE, 0)
+        return vertex.p + distance * direction, direction, distance, weight
 
     def _field_of_extinction(
         self, mean: mi.Float | mi.Color3f, classes: VoxelClasses | None

@@ -7,8 +7,6 @@ lies in between. It varies by an order of magnitude within a voxel next to the e
 
 from __future__ import annotations
 
-import functools
-import operator
 from itertools import pairwise
 
 import drjit as dr
@@ -100,15 +98,13 @@ class SolidAngle:
     def shares(self, p: mi.Point3f) -> list[mi.Float]:
         """Return the share of each face in the solid angle at world positions, for `sample`.
 
-        Flat shapes have one face. From inside of a box all faces are seen, from behind.
+        Flat shapes have one face. From inside of a box, which sees no face, all shares are 0.
         """
         if len(self._polygons) < 2:
             return [mi.Float(1)]
-        seen = [dr.dot(front, p - corners[0]) > 0 for corners, front in self._polygons]
-        is_inside = ~functools.reduce(operator.or_, seen)
         angles = [
-            dr.select(face | is_inside, _polygon_solid_angle(corners, p), 0)
-            for face, (corners, _) in zip(seen, self._polygons, strict=True)
+            dr.select(dr.dot(front, p - corners[0]) > 0, _polygon_solid_angle(corners, p), 0)
+            for corners, front in self._polygons
         ]
         total = sum(angles)
         return [angle / dr.maximum(total, 1e-30) for angle in angles]
@@ -118,9 +114,9 @@ class SolidAngle:
     ) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
         """Sample a point of any shape but a sphere, approximately uniformly by solid angle.
 
-        Both sides of a face are sampled alike. ``shares`` is the result of `shares`. Returns the
-        direction and distance of the point, and the solid angle that it represents (the inverse of
-        its density), which varies smoothly and by a small factor between the points.
+        Both sides of a flat shape are sampled alike. ``shares`` is the result of `shares`. Returns
+        the direction and distance of the point, and the solid angle that it represents (the inverse
+        of its density), which varies smoothly and by a small factor between the points.
 
         Lines parallel to one edge are sampled uniformly by the angle in the plane perpendicular to
         them, and points on a line by their solid angle, whose distribution is invertible.

@@ -14,7 +14,7 @@ from mitsuba_irrcache.transport.path import medium_after, sample_bsdf
 
 #: Maximum number of reflected paths that wait, per lane.
 PLACES = 2
-#: Throughput of the reflected path below which one of both is chosen at random instead.
+#: Throughput of either path below which one of both is chosen at random instead.
 NEGLIGIBLE = 2e-3
 
 
@@ -55,7 +55,8 @@ def split(
     transmitted = _lobe(si, samples, both, clear)
     direction, f, scale, _, pdf = _lobe(si, samples, both, mirror)
     f = throughput * f
-    both &= (dr.max(transmitted[1]) > 0) & (dr.max(f) > NEGLIGIBLE)
+    # At total reflection the transmittance is 0 but for rounding, which differs between backends.
+    both &= (dr.max(throughput * transmitted[1]) > NEGLIGIBLE) & (dr.max(f) > NEGLIGIBLE)
     reflected = si.spawn_ray(direction), medium_after(si, direction, pointer), f, eta * scale
     placed, result = mi.Bool(False), []
     for taken, *path in waiting:

@@ -49,6 +49,9 @@ COARSER, COARSEST = 0.2, 0.03
 SUBSTEP_DEPTH, MOST_SUBSTEPS = 0.15, 8
 #: Number of steps for each voxel of an emissive grid where no finer cache shortens the steps.
 EMISSION_STEPS = 4
+#: Number of lengths along the longest side of a medium without a cache over which its radiance is
+#: assumed to vary: the number of voxels of the coarsest default cache.
+UNCACHED_CELLS = 32
 #: Multiple of the offset of a ray whose fraction is another random number.
 FRACTION = 1024.0
 #: Maximum optical depth per step of the packed extinction: the 16-bit format has a limited range,
@@ -147,9 +150,15 @@ class Projection:
             count = min(2 ** int(np.ceil(np.log2(depth / SUBSTEP_DEPTH))), MOST_SUBSTEPS)
             self.substeps, length = dr.opaque(mi.Float, count), length / count
         self.step = dr.opaque(mi.Float, float(length))
-        #: shortest edge of a voxel of the cache or, without one, of the medium
-        on_grid = irradiance is not None and irradiance.grid is not None
-        cell = irradiance.grid.voxel_size.min() if on_grid else medium.shortest_edge
+        #: length over which the radiance of the medium varies: the shortest edge of a voxel of the
+        #: cache or, without one, of the data, at most that of the coarsest default cache
+        if irradiance is not None and irradiance.grid is not None:
+            cell = irradiance.grid.voxel_size.min()
+        else:
+            longest = np.linalg.norm(medium.frame[:3, :3], axis=0).max()
+            cell = min(medium.shortest_edge, longest / UNCACHED_CELLS)
+            if medium.emission is not None and medium.emission.grid is not None:
+                cell = min(cell, medium.emission.grid.voxel_size.min())
         self.cell = dr.opaque(mi.Float, float(cell))
         #: scattering into the truncated forward peak over the remaining scattering coefficient
         self._peak_share: mi.Float | None = None

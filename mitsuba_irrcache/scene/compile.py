@@ -77,6 +77,7 @@ def compile_scene(
             _check_distance(medium.id(), np.abs([lower, upper]).max(), finest)
     for emitter in scene.emitters():
         check_placement(emitter)
+        _warn_of_weight(emitter)
     for sensor in scene.sensors():
         check_sensor(scene, sensor)
     boundary = _boundary_without_surfaces(scene, media)
@@ -424,6 +425,17 @@ def _warn_of_coincidence(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
                     "radiance may pass the surface, also in volpath. Extend the boundary "
                     "beyond the surface, or leave a gap of a thousandth of its size.",
                 )
+
+
+def _warn_of_weight(emitter: mi.Emitter) -> None:
+    """Log a warning for an emitter that other integrators never sample."""
+    if not np.any(np.array(mi.traverse(emitter).get("sampling_weight", 1.0))):
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'irrcache: emitter "{emitter.id()}" has sampling_weight 0. It illuminates the scene '
+            "nevertheless, while other integrators never sample it. Set its radiance or intensity "
+            "to 0 to switch it off.",
+        )
 
 
 def _lie_in_a_face(p: np.ndarray, frame: np.ndarray) -> bool:

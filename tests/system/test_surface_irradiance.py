@@ -234,6 +234,26 @@ def test_nodes_are_kept_while_the_cache_is_refined(scenes):
     np.testing.assert_allclose(refined, fresh, rtol=2e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("sigma_t", [3.0, np.full((2, 2, 2), 3.0)], ids=["constant", "grid"])
+def test_shadow_of_a_medium_without_a_cache(scenes, sigma_t):
+    """The ground around a medium that does not scatter, and has no cache, is that around the same
+    medium on a fine grid.
+
+    Without the voxels of a cache, irradiance was interpolated over the size of the medium.
+    """
+
+    def rendered(sigma_t) -> np.ndarray:
+        smoke = scenes.boundary(scenes.medium(sigma_t, 0.0, scenes.placement()))
+        objects = {"smoke": smoke, "floor": ground(-1.02), "emitter": {"type": "constant"}}
+        return scenes.image(scene_of(scenes, objects), spp=64)[..., :3]
+
+    found, expected = (
+        x.reshape(6, 4, 6, 4, 3).mean(axis=(1, 3))
+        for x in (rendered(sigma_t), rendered(np.full((32, 32, 32), 3.0)))
+    )
+    assert np.abs(found - expected).max() < 0.02 * expected.mean()
+
+
 def test_edits_of_a_surface_are_seen(scenes):
     scene = scene_of(scenes, within())
     scenes.image(scene, spp=2)

@@ -87,6 +87,16 @@ def test_surfaces_in_a_face_of_the_boundary_are_named(scenes, monkeypatch, heigh
     assert all('"floor"' in text for text in found)
 
 
+@pytest.mark.parametrize(("weight", "expected"), [(0.0, 1), (2.0, 0)])
+def test_emitters_that_are_never_sampled_are_noted(scenes, logged, weight, expected):
+    lamp = {"type": "point", "position": [2, 0, 0], "sampling_weight": weight}
+    shape = scenes.boundary(scenes.medium(1.0, 0.5))
+    compile_scene(scenes.load({"type": "volpath"}, shape, lamp=lamp))
+    found = [text for text in logged if "sampling_weight 0" in text]
+    assert len(found) == expected
+    assert all('"lamp"' in text for text in found)
+
+
 def test_shapes_without_sampled_positions_are_described(scenes):
     """Mitsuba samples no positions on instances and signed distance fields."""
     beside = mi.ScalarTransform4f().translate([3, 0, 0])
