@@ -104,8 +104,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
          of 8 samples or 32 to 256 directions. Not counted are the directions with which all orders
          are solved for, those of ``directional`` emitters, those sampled from an ``envmap``, and
-         those along which surfaces illuminate the medium. 0: 128 directions; 64 with surfaces
-         unless emitters are in the medium (256 for forward peaks); twice as many for single
+         those along which surfaces illuminate the medium. 0: 128 directions, 256 for forward peaks;
+         64 with surfaces unless emitters are in the medium; twice as many for single
          isotropic scattering; 64 for all orders of it under constant environments; ``path``: 16 to
          256 samples, about 2^24 for all voxels, 2^22 with surfaces, 2^23 behind glass.
          (Default: 0)
