@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.splatting import (
     SLOTS,
     ConstantSplat,
@@ -94,3 +95,18 @@ def test_voxel_sums_count_points_in_their_voxels():
     np.testing.assert_array_equal(ones, expected)
     np.testing.assert_array_equal(twos, 2 * expected)
     assert dr.width(sums.values()[0]) == grid.voxel_count
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_values_that_are_not_finite_are_refused(value):
+    """Fixed point would turn them into large numbers; those of inactive lanes do not matter."""
+    grid = Grid((2, 2, 2), placement())
+    p = mi.Point3f([0.1, 0.2], 0.0, 0.0)
+    values = [mi.Float([1.0, value])]
+    for kind in (GridSplat, VoxelSums):
+        splat = kind(grid, 1, 4.0)
+        splat.add(p, values, mi.Bool([True, False]))
+        splat.values()
+        splat.add(p, values, mi.Bool(True))
+        with pytest.raises(IrrcacheError, match=r"not finite.*report"):
+            splat.values()
