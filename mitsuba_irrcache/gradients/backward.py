@@ -33,6 +33,9 @@ from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
 from mitsuba_irrcache.solvers.base import registered
 
+#: Least width of the beam of a spot at the centre of the medium, in voxels of the cache. At three
+#: voxels the derivative with respect to its intensity is 15 % too small, at six within 2 %.
+BEAM_VOXELS = 4
 #: Kinds of emitters whose radiance the adjoint equation and the derivatives of images include.
 EMITTERS = frozenset(
     (
@@ -75,6 +78,8 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
     depth = part.settings.max_depth
     if depth > 2:
         refuse_all(keys, f"max_depth is {depth}", "Set max_depth to 1, 2 or -1")
+    if part.cache is not None:
+        _check_spots(part, keys)
     if medium.phase.forward and part.cache is not None:
         for light in part.description.emitters.of(*POINT_LIKE):
             # Irradiance and scattering into rays vary too much within the voxels around it.
@@ -84,6 +89,26 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
                     f'emitter "{light.id()}" is in {name}, which scatters sharply',
                     "Move it out of the medium, or make the phase function broader",
                 )
+
+
+def _check_spots(part: CachedMedium, keys: list[str]) -> None:
+    """Refuse spots whose beams are narrower than `BEAM_VOXELS`: the adjoint fluence of a voxel is
+    multiplied by the irradiance at one position of it.
+    """
+    grid = part.cache.grid
+    centre = grid.to_world[:3, :3] @ [0.5, 0.5, 0.5] + grid.to_world[:3, 3]
+    for light in part.description.emitters.of(EmitterKind.SPOT):
+        position = position_of(light)
+        angle = np.deg2rad(min(float(np.ravel(mi.traverse(light)["cutoff_angle"])[0]), 89.0))
+        width = 2 * np.linalg.norm(position - centre) * np.tan(angle)
+        is_inside = edges_away(position[:, None], grid) < 1
+        if is_inside or width < BEAM_VOXELS * grid.voxel_size.max():
+            where = "in the medium" if is_inside else f"narrower than {BEAM_VOXELS} voxels"
+            refuse_all(
+                keys,
+                f'the beam of the spot "{light.id()}" is {where}',
+                "Move it away, widen its cutoff_angle or raise resolution",
+            )
 
 
 class ParameterAdjoint:

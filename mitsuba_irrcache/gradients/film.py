@@ -39,6 +39,12 @@ class SampledCamera:
 
     def __init__(self, sensor: mi.Sensor, seed: int, spp: int, lanes: int = LANES) -> None:
         self._sensor, self._film = sensor, sensor.film()
+        if "pixel_format = xyz" in str(self._film):  # no other sign of the conversion
+            raise IrrcacheError(
+                'irrcache: gradients of images with the pixel_format "xyz" or "xyza" are not '
+                'supported; use a film with "rgb", "rgba" or "luminance", and convert the image in '
+                "the loss."
+            )
         self._seed, self._spp = seed, spp or sensor.sampler().sample_count()
         self._frame = SampledFilm(self._film, self._spp, lanes)
         #: medium around the sensor

@@ -476,6 +476,33 @@ def test_scenes_without_gradients_are_refused(rgb, scenes):
     assert "has no cache" in refused(opaque, "sigma_t.value.value")
 
 
+@pytest.mark.parametrize(
+    ("height", "angle", "reason"),
+    [(0.4, 40.0, "is in the medium"), (3.0, 2.0, "is narrower than 4 voxels")],
+)
+def test_spots_whose_beams_are_narrow_are_refused(rgb, height, angle, reason):
+    """Derivatives by the intensity of such spots were up to four times too large."""
+    look = mi.ScalarTransform4f().look_at([0.1, height, 0], [0.1, -1, 0], [1, 0, 0])
+    lamp = {"type": "spot", "to_world": look, "cutoff_angle": angle}
+    scene = Case(data=8, cache=8, emitters=lambda: {"lamp": lamp}).load()
+    assert f'the beam of the spot "lamp" {reason}' in refused(scene, "sigma_t.data")
+
+
+@pytest.mark.parametrize("backwards", [True, False])
+def test_images_of_other_colour_spaces_are_refused(rgb, backwards):
+    """Gradients of images in XYZ were those of RGB."""
+    scene = Case(data=8, cache=8, pixels="xyz").load()
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if k.endswith("sigma_t.data")]
+    scale = mi.Float(1)
+    dr.enable_grad(scale)
+    params[key] = params[key] * scale
+    params.update()
+    image = mi.render(scene, params, spp=1)
+    with pytest.raises(IrrcacheError, match='pixel_format "xyz"'):
+        dr.backward(dr.mean(image)) if backwards else dr.forward(scale)
+
+
 def test_points_in_sharply_scattering_matter_are_refused(rgb):
     scene = Case(data=8, cache=8, g=0.6, emitters=lambda: {"lamp": LAMP}).load()
     assert 'emitter "lamp" is in medium' in refused(scene, "sigma_t.data")
