@@ -116,7 +116,8 @@ class SolidAngle:
 
         Both sides of a flat shape are sampled alike. ``shares`` is the result of `shares`. Returns
         the direction and distance of the point, and the solid angle that it represents (the inverse
-        of its density), which varies smoothly and by a small factor between the points.
+        of its density), which varies smoothly and by a small factor between the points; 0 from
+        inside of a box.
 
         Lines parallel to one edge are sampled uniformly by the angle in the plane perpendicular to
         them, and points on a line by their solid angle, whose distribution is invertible.
@@ -154,7 +155,8 @@ class SolidAngle:
         length = dr.norm(direction)
         ratio = dr.sqrt(distance + dr.square(t)) / dr.maximum(length, 1e-30)
         angle = dr.abs(height) / away * ratio * dr.square(ratio) * (last - first) * (after - before)
-        return direction / dr.maximum(length, 1e-30), length, angle / dr.maximum(share, 1e-30)
+        angle = dr.select(share > 0, angle / dr.maximum(share, 1e-30), 0)
+        return direction / dr.maximum(length, 1e-30), length, angle
 
 
 def _shape_frame(shape: mi.Shape) -> tuple[str, np.ndarray] | None:

@@ -81,7 +81,7 @@ def test_closest_point(name):
 @pytest.mark.parametrize("sheared", [False, True])
 def test_sampled_points(name, sheared):
     """Sampled points lie on the shape, where they are seen; their mean weight is the solid angle,
-    from the back of flat shapes too, and no weight is much larger.
+    from the back of flat shapes too, and no weight is much larger. Inside of a cube all are 0.
     """
     frame = SolidAngle.of(emitter(SHAPES[name])).frame
     if sheared:
@@ -100,12 +100,12 @@ def test_sampled_points(name, sheared):
         else:
             extent = np.hypot(*local[:2]) if name == "disk" else np.abs(local[:2]).max(axis=0)
             assert np.abs(local[2]).max() < 1e-5 and extent.max() < 1 + 1e-4
-        seen = max(float(angle.at(mi.Point3f(p))[0]), _behind(angle, p)) or 4 * np.pi
+        seen = max(float(angle.at(mi.Point3f(p))[0]), _behind(angle, p))
         # The solid angle of a disk is that of a polygon.
         assert float(dr.mean(weight)[0]) == pytest.approx(
             seen, rel=0.02 if name == "disk" else 1e-3
         )
-        assert float(dr.max(weight)[0]) < 3 * seen
+        assert float(dr.max(weight)[0]) <= 3 * seen
 
 
 @pytest.mark.parametrize("name", ["rectangle", "disk", "cube"])
