@@ -28,9 +28,9 @@ from tests.support.scenes import (
 )
 
 shorten_compilation()
-# Idle threads of Dr.Jit wait actively: more of them than cores take a quarter of the time.
 #: Dr.Jit backend of the variants under test: "llvm" or "cuda".
 BACKEND = os.environ.get("IRRCACHE_TEST_BACKEND", "llvm")
+# Idle threads of Dr.Jit wait actively: more of them than cores take a quarter of the time.
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 THREADS = max(1, (os.cpu_count() or 1) // WORKERS)
 

@@ -27,7 +27,7 @@ from mitsuba_irrcache.gradients.tangent import ImageTangent, changed_field
 from mitsuba_irrcache.gradients.traced import check as check_traced
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of, position_of
-from mitsuba_irrcache.lights.falloff import edges_away
+from mitsuba_irrcache.lights.falloff import lies_in
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
@@ -78,12 +78,13 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
     depth = part.settings.max_depth
     if depth > 2:
         refuse_all(keys, f"max_depth is {depth}", "Set max_depth to 1, 2 or -1")
-    if part.cache is not None:
-        _check_spots(part, keys)
-    if medium.phase.forward and part.cache is not None:
+    if part.cache is None:
+        return
+    _check_spots(part, keys)
+    if medium.phase.forward:
         for light in part.description.emitters.of(*POINT_LIKE):
             # Irradiance and scattering into rays vary too much within the voxels around it.
-            if edges_away(position_of(light)[:, None], part.cache.grid) < 1:
+            if lies_in(light, part.cache.grid):
                 refuse_all(
                     keys,
                     f'emitter "{light.id()}" is in {name}, which scatters sharply',
@@ -98,10 +99,9 @@ def _check_spots(part: CachedMedium, keys: list[str]) -> None:
     grid = part.cache.grid
     centre = grid.to_world[:3, :3] @ [0.5, 0.5, 0.5] + grid.to_world[:3, 3]
     for light in part.description.emitters.of(EmitterKind.SPOT):
-        position = position_of(light)
         angle = np.deg2rad(min(float(np.ravel(mi.traverse(light)["cutoff_angle"])[0]), 89.0))
-        width = 2 * np.linalg.norm(position - centre) * np.tan(angle)
-        is_inside = edges_away(position[:, None], grid) < 1
+        width = 2 * np.linalg.norm(position_of(light) - centre) * np.tan(angle)
+        is_inside = lies_in(light, grid)
         if is_inside or width < BEAM_VOXELS * grid.voxel_size.max():
             where = "in the medium" if is_inside else f"narrower than {BEAM_VOXELS} voxels"
             refuse_all(
@@ -223,7 +223,7 @@ def check_placements(placed: dict[str, Placement], grid: Grid) -> None:
     for key, role in placed.items():
         if kind_of(role.emitter) is EmitterKind.SUN:
             continue
-        if edges_away(position_of(role.emitter)[:, None], grid) < 1:
+        if lies_in(role.emitter, grid):
             refuse(key, "the light is in the medium")
 
 

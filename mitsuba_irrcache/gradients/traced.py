@@ -27,8 +27,8 @@ from mitsuba_irrcache.gradients.parameters import (
 )
 from mitsuba_irrcache.gradients.replay import CameraSplats
 from mitsuba_irrcache.gradients.surroundings import LANES, CoupledMedium, Surroundings
-from mitsuba_irrcache.lights.emitters import POINT_LIKE, position_of
-from mitsuba_irrcache.lights.falloff import edges_away
+from mitsuba_irrcache.lights.emitters import POINT_LIKE
+from mitsuba_irrcache.lights.falloff import lies_in
 from mitsuba_irrcache.media.bake import children
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.scene.compile import media_of
@@ -81,7 +81,7 @@ def _check_medium(part: CachedMedium, keys: list[str]) -> None:
     if part.cache.voxel_classes is not None:
         refuse_all(keys, f"a surface reaches into {name}", "Move it out")
     for light in part.description.emitters.of(*POINT_LIKE):
-        if edges_away(position_of(light)[:, None], part.cache.grid) < 1:
+        if lies_in(light, part.cache.grid):
             refuse_all(keys, f'emitter "{light.id()}" is in {name} {among}', "Move it out")
 
 

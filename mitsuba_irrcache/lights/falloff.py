@@ -234,6 +234,11 @@ def _of_area(shape: mi.Shape, grid: Grid) -> list[tuple[np.ndarray, float, float
     ]
 
 
+def lies_in(emitter: mi.Emitter, grid: Grid) -> bool:
+    """Return whether a point-like emitter lies in the box of ``grid`` or within a voxel of it."""
+    return edges_away(position_of(emitter)[:, None], grid) < 1
+
+
 def edges_away(positions: np.ndarray, grid: Grid) -> float:
     """Return the minimum distance of ``positions`` (3, n) from the box of ``grid``.
 

@@ -173,11 +173,12 @@ def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
     interaction.p = p
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(interaction, True)
     own_sigma_t = mi.Spectrum(grid.sigma_t.at_world(p))
-    own_sigma_s = own_sigma_t * grid.albedo.at_world(p)
+    own_albedo = grid.albedo.at_world(p)
+    own_sigma_s = own_sigma_t * own_albedo
     scale = max(grid.sigma_t.maximum, 1e-30)
     inexact_sigma_t = error_of_texture_units(grid.sigma_t, p)
     inexact_albedo = error_of_texture_units(grid.albedo, p)
-    inexact_sigma_s = own_sigma_t * inexact_albedo + grid.albedo.at_world(p) * inexact_sigma_t
+    inexact_sigma_s = own_sigma_t * inexact_albedo + own_albedo * inexact_sigma_t
     error = dr.maximum(
         dr.max(dr.abs(mi.Spectrum(sigma_t) - own_sigma_t) - inexact_sigma_t),
         dr.max(dr.abs(mi.Spectrum(sigma_s) - own_sigma_s) - inexact_sigma_s),

@@ -135,6 +135,7 @@ class Projection:
         albedo = _simplified(medium.albedo)
         fields = medium.sigma_t, medium.albedo, irradiance, medium.emission
         grids = [f.grid for f in fields if f and f.grid]
+        emissive_grid = medium.emission.grid if medium.emission is not None else None
         # For constant fields, one step is exact.
         length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
         #: number of steps of the lattice into which a step is divided where the medium is dense;
@@ -143,7 +144,7 @@ class Projection:
         depth = border_depth * step
         if irradiance is None and np.isfinite(length):
             # The voxels of the data, which may be thick, determine the steps, not those of a cache.
-            if medium.emission is not None and medium.emission.grid is not None:
+            if emissive_grid is not None:
                 length /= EMISSION_STEPS
             depth = max(depth, medium.sigma_t.maximum * length)
         if depth > SUBSTEP_DEPTH and RULES[quadrature].is_third_order and np.isfinite(length):
@@ -157,8 +158,8 @@ class Projection:
         else:
             longest = np.linalg.norm(medium.frame[:3, :3], axis=0).max()
             cell = min(medium.shortest_edge, longest / UNCACHED_CELLS)
-            if medium.emission is not None and medium.emission.grid is not None:
-                cell = min(cell, medium.emission.grid.voxel_size.min())
+            if emissive_grid is not None:
+                cell = min(cell, emissive_grid.voxel_size.min())
         self.cell = dr.opaque(mi.Float, float(cell))
         #: scattering into the truncated forward peak over the remaining scattering coefficient
         self._peak_share: mi.Float | None = None

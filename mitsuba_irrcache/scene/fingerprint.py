@@ -39,9 +39,9 @@ class SceneVersion:
     with another index.
 
     Only writes through a NumPy view of an array (on a GPU, one of another library) keep its index.
-    Therefore the contents of small
-    arrays are compared too, and a few thousand values of larger ones. Code that edits a large array
-    through a view has to call ``params.set_dirty``, which Mitsuba requires as well.
+    Therefore the contents of small arrays are compared too, and a few thousand values of larger
+    ones. Code that edits a large array through a view has to call ``params.set_dirty``, which
+    Mitsuba requires as well.
 
     A version keeps the old arrays of an edited scene alive until the next rendering, which
     releases them before it creates the new cache.

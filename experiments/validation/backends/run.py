@@ -17,9 +17,13 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
+
+if TYPE_CHECKING:  # these modules are imported when a variant is set
+    from experiments.validation.gradients.cases import Case
 
 PIXELS, SPP = 48, 32
 
@@ -52,12 +56,10 @@ def images(load: Callable[[], mi.Scene]) -> dict[str, np.ndarray]:
     return {"image": image, "seconds": np.array(seconds)}
 
 
-def gradients(name: str) -> dict[str, np.ndarray]:
+def gradients(case: Case) -> dict[str, np.ndarray]:
     """Return the gradients of a case by the parameters that it names, and the time [s]."""
     from experiments.validation.gradients import differences
-    from experiments.validation.gradients.cases import CASES
 
-    case = CASES[name]
     begun, scene = time.perf_counter(), case.load()
     weights = differences.pixel_weights(scene)
     found = differences.gradients(scene, case.parameters, weights)
@@ -97,7 +99,9 @@ def main() -> None:
     from experiments.validation.gradients.cases import CASES
 
     tasks = {name: lambda load=load: images(load) for name, load in scenes()}
-    tasks |= {f"gradients, {name}": lambda name=name: gradients(name) for name in CASES}
+    tasks |= {
+        f"gradients, {name}": lambda case=case: gradients(case) for name, case in CASES.items()
+    }
     folder = args.output / args.variant
     folder.mkdir(parents=True, exist_ok=True)
     for number, (name, task) in enumerate(tasks.items()):

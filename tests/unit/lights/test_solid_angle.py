@@ -105,7 +105,7 @@ def test_sampled_points(name, sheared):
         assert float(dr.mean(weight)[0]) == pytest.approx(
             seen, rel=0.02 if name == "disk" else 1e-3
         )
-        assert float(dr.max(weight)[0]) <= 3 * seen
+        assert float(dr.max(weight)[0]) < 3 * seen or not dr.any(weight != 0)
 
 
 @pytest.mark.parametrize("name", ["rectangle", "disk", "cube"])

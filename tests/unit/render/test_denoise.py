@@ -334,8 +334,8 @@ def test_choice_from_a_sample_of_pixels(rgb, monkeypatch):
 def test_other_images_compile_nothing(rgb, kernels):
     """Images of other sizes, noise and numbers of valid pixels reuse all kernels.
 
-    The exception is the copy of dr.concat, 8 to 11 operations, which embeds the lengths of its
-    parts.
+    The exception is the copy of dr.concat, which embeds the lengths of its parts: 8 operations,
+    11 on a GPU.
     """
 
     def prepared(size: int, hole: int, seed: int) -> Layers:
@@ -360,4 +360,4 @@ def test_other_images_compile_nothing(rgb, kernels):
         again = kernels(lambda layers=layers, size=size: run(layers, size))
         assert any(k["operation_count"] > 100 for k in again)
         new = [k["operation_count"] for k in again if k["hash"] not in first]
-        assert max(new, default=0) < 15
+        assert max(new, default=0) < (10 if mi.variant().startswith("llvm") else 12)

@@ -47,7 +47,8 @@ def test_sums_are_those_of_mitsuba(name, crop, per_pixel):
     found = np.array([np.array(s) for s in sums], dtype=np.float64)
     means = (found[:6] / found[6]).T.reshape(*np.array(film.crop_size())[::-1], 6)
     colours = developed.shape[-1] - 2
-    tolerance = {"rtol": 3e-6, "atol": 1e-5}
+    # GPUs approximate the sine of lanczos.
+    tolerance = {"rtol": 1e-7 if mi.variant().startswith("llvm") else 3e-6, "atol": 1e-5}
     np.testing.assert_allclose(developed[..., :colours], means[..., :colours], **tolerance)
     np.testing.assert_allclose(developed[..., colours:], means[..., 4:], **tolerance)
 
