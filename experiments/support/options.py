@@ -72,10 +72,11 @@ def add_document(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def begin() -> None:
+def begin(variant: str = "llvm_ad_rgb") -> None:
     """Set Mitsuba's variant."""
-    require_llvm()
-    mi.set_variant("llvm_ad_rgb")
+    if variant.startswith("llvm"):
+        require_llvm()
+    mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
 
 

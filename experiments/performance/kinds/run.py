@@ -1,7 +1,8 @@
 """Time to an error for each kind of scene, including those where irrcache is slower.
 
     python -m experiments.performance.kinds.run [--kinds NAME ...] [--pixels 128] [--seconds 10]
-        [--budget 1200] [--force] [-o output] [--document docs/performance.md]
+        [--budget 1200] [--variant cuda_ad_rgb] [--force] [-o output]
+        [--document docs/performance.md]
 
 Each scene is rendered by ``irrcache`` with its default properties, with all orders of scattering,
 and 1, 4, 16 and 64 samples per pixel until the smallest target is reached. Errors are RMSE in units
@@ -10,7 +11,7 @@ stock integrator). Beside them the best of volpath, volpathmis and prbvolpath at
 ``rr_depth``, whose time to an error is its variance over the square of the error, times the
 duration of a sample. Kernels are warm, loading is excluded.
 
-Rows are saved in output/kinds/results.json; none is started after ``--budget`` seconds: run it
+Rows are saved in output/kinds/VARIANT.json; none is started after ``--budget`` seconds: run it
 again for the others.
 """
 
@@ -39,6 +40,8 @@ DEFAULT_SPP = 16
 STOCK, RR_DEPTHS = ("volpath", "volpathmis", "prbvolpath"), (5, 1000)
 #: Images of a stock integrator for its variance, and seconds of one.
 STOCK_IMAGES, STOCK_SECONDS = 3, 1.0
+#: Most samples of an image of a stock integrator: bounds the memory of wavefronts on GPUs.
+STOCK_SAMPLES = 1 << 26
 #: Relative difference of their means, and standard errors of it, beyond which one is wrong.
 BIAS, SIGMAS = 0.01, 6
 #: Images by irrcache with independent caches; seconds of an image above which there is only one.
@@ -88,7 +91,7 @@ def stock_row(build: Callable[[], dict], pixels: int, name: str, rr_depth: int) 
     scene = load(build, pixels, name, rr_depth)
     picture(scene, 1, 0)
     _, once = picture(scene, 1, 1)
-    spp = max(1, int(STOCK_SECONDS / once))
+    spp = int(np.clip(STOCK_SECONDS / once, 1, STOCK_SAMPLES / pixels**2))
     images, times = zip(
         *(picture(scene, spp, seed) for seed in range(2, 2 + STOCK_IMAGES)), strict=True
     )
@@ -164,7 +167,7 @@ def solver_of(build: Callable[[], dict], pixels: int) -> str:
     return scene.integrator()._builder.solver
 
 
-def table(rows: dict[str, dict], pixels: int) -> Table:
+def table(rows: dict[str, dict], pixels: int, variant: str) -> Table:
     """Tabulate the rows; errors below the resolution of the reference count as that, and targets
     below it are not resolved.
     """
@@ -173,7 +176,8 @@ def table(rows: dict[str, dict], pixels: int) -> Table:
     head += [f"camera moved, {min(TARGETS):.1%}", "faster below"]
     head += [f"RMSE at {DEFAULT_SPP} spp", f"of {BLOCK} x {BLOCK} blocks", "mean"]
     cells = [[name, row["solver"], *_speeds(row), *_errors(row)] for name, row in rows.items()]
-    return Table(f"Ratios to the best stock integrator, {pixels} x {pixels} pixels", head, cells)
+    title = f"Ratios to the best stock integrator, {pixels} x {pixels} pixels, {variant}"
+    return Table(title, head, cells)
 
 
 def _speeds(row: dict) -> list[str]:
@@ -211,12 +215,13 @@ def main() -> None:
     parser.add_argument("--pixels", type=int, default=128, help="per side")
     parser.add_argument("--budget", type=float, default=1200, help="no row is begun later")
     parser.add_argument("--seconds", type=float, default=10, help="of half a reference")
+    parser.add_argument("--variant", default="llvm_ad_rgb")
     add_document(parser)
     args = parser.parse_args()
-    begin()
+    begin(args.variant)
     folder = args.output / "kinds"
     folder.mkdir(parents=True, exist_ok=True)
-    store, started = Store(folder / "results.json"), time.perf_counter()
+    store, started = Store(folder / f"{args.variant}.json"), time.perf_counter()
     for name in args.kinds:
         key = f"{name} {args.pixels}"
         if (args.force or key not in store.rows) and time.perf_counter() - started > args.budget:
@@ -225,12 +230,13 @@ def main() -> None:
         if args.force:  # the others are kept
             store.rows.pop(key, None)
         store.row(key, partial(compute, KINDS[name], args.pixels, args.seconds))
-        print(table({name: store.rows[key]}, args.pixels).as_text(), flush=True)
+        print(table({name: store.rows[key]}, args.pixels, args.variant).as_text(), flush=True)
     found = {name: store.rows.get(f"{name} {args.pixels}") for name in KINDS}
-    whole = table({name: row for name, row in found.items() if row}, args.pixels)
+    whole = table({name: row for name, row in found.items() if row}, args.pixels, args.variant)
     print(whole.as_text())
     if args.document:
-        replace_tables(args.document, {"kinds": whole})
+        on_gpu = args.variant.startswith("cuda")
+        replace_tables(args.document, {"kinds-on-a-gpu": whole} if on_gpu else {"kinds": whole})
 
 
 if __name__ == "__main__":
