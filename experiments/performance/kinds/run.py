@@ -136,6 +136,9 @@ def irrcache_row(
     picture(scene, spp, 0)  # compiles kernels
     mean, rows = np.mean(halves), []
     for seed in range(RUNS):
+        # Free the scene before: Dr.Jit's kernels contain the numbers of the scene's objects, which
+        # are others while the old ones exist.
+        scene = None
         scene = load(build, pixels, "irrcache")
         image, cold = picture(scene, spp, seed)
         moved = picture(scene, spp, seed + 100)[1]
