@@ -36,6 +36,7 @@ from mitsuba_irrcache.lights.emitters import (
     SPOT_LIKE,
     EmitterKind,
     EmittersByKind,
+    illuminating,
     kind_of,
     position_of,
     spot_lights,
@@ -329,7 +330,7 @@ def direct_lights_of(
         return []
     emitters = spot_lights(scene)
     if dense and medium.is_isolated:
-        emitters = EmittersByKind(scene.emitters()).of(EmitterKind.SUN, *POINT_LIKE)
+        emitters = EmittersByKind(illuminating(scene)).of(EmitterKind.SUN, *POINT_LIKE)
     where = medium, grid, voxels, classes
     return [DirectLight(scene, emitter, *where, pause) for emitter in emitters]
 

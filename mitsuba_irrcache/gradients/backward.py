@@ -8,6 +8,7 @@ from functools import cached_property
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.gradients.beams import check_beams
 from mitsuba_irrcache.gradients.emitter_tangents import EmitterTangents
 from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
 from mitsuba_irrcache.gradients.film import LANES, FilmAdjoint
@@ -26,16 +27,13 @@ from mitsuba_irrcache.gradients.parameters import (
 from mitsuba_irrcache.gradients.tangent import ImageTangent, changed_field
 from mitsuba_irrcache.gradients.traced import check as check_traced
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of, position_of
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of
 from mitsuba_irrcache.lights.falloff import lies_in
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
 from mitsuba_irrcache.solvers.base import registered
 
-#: Least width of the beam of a spot at the centre of the medium, in voxels of the cache. At three
-#: voxels the derivative with respect to its intensity is 15 % too small, at six within 2 %.
-BEAM_VOXELS = 4
 #: Kinds of emitters whose radiance the adjoint equation and the derivatives of images include.
 EMITTERS = frozenset(
     (
@@ -80,7 +78,7 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
         refuse_all(keys, f"max_depth is {depth}", "Set max_depth to 1, 2 or -1")
     if part.cache is None:
         return
-    _check_spots(part, keys)
+    check_beams(part, keys)
     if medium.phase.forward:
         for light in part.description.emitters.of(*POINT_LIKE):
             # Irradiance and scattering into rays vary too much within the voxels around it.
@@ -90,25 +88,6 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
                     f'emitter "{light.id()}" is in {name}, which scatters sharply',
                     "Move it out of the medium, or make the phase function broader",
                 )
-
-
-def _check_spots(part: CachedMedium, keys: list[str]) -> None:
-    """Refuse spots whose beams are narrower than `BEAM_VOXELS`: the adjoint fluence of a voxel is
-    multiplied by the irradiance at one position of it.
-    """
-    grid = part.cache.grid
-    centre = grid.to_world[:3, :3] @ [0.5, 0.5, 0.5] + grid.to_world[:3, 3]
-    for light in part.description.emitters.of(EmitterKind.SPOT):
-        angle = np.deg2rad(min(float(np.ravel(mi.traverse(light)["cutoff_angle"])[0]), 89.0))
-        width = 2 * np.linalg.norm(position_of(light) - centre) * np.tan(angle)
-        is_inside = lies_in(light, grid)
-        if is_inside or width < BEAM_VOXELS * grid.voxel_size.max():
-            where = "in the medium" if is_inside else f"narrower than {BEAM_VOXELS} voxels"
-            refuse_all(
-                keys,
-                f'the beam of the spot "{light.id()}" is {where}',
-                "Move it away, widen its cutoff_angle or raise resolution",
-            )
 
 
 class ParameterAdjoint:
@@ -177,7 +156,9 @@ class ParameterAdjoint:
                 g = float(np.array(change).ravel()[0])
             else:
                 fields[role] = changed_field(value, change, medium, role)
-        return ImageTangent(medium, fields, g, EmitterTangents(self._scene, by_emitter))
+        is_coloured = self._part.medium.sigma_t.channels > 1
+        emitters = EmitterTangents(self._scene, by_emitter, is_coloured)
+        return ImageTangent(medium, fields, g, emitters)
 
     @cached_property
     def _adjoint(self) -> MediumAdjoint:

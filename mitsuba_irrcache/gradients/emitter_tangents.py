@@ -9,21 +9,26 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.emitters import solid_angles
 from mitsuba_irrcache.gradients.lights import LightsOfOneDirection
+from mitsuba_irrcache.gradients.parameters import refuse
 from mitsuba_irrcache.gradients.transport import AdjointTransport
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind, illuminating, kind_of
 
 
 class EmitterTangents:
     """Changes of the emitters of ``scene``.
 
     ``changes`` has the change of the parameter on which the radiance of an emitter depends and the
-    value and key of this parameter, by emitter.
+    value and key of this parameter, by emitter. ``is_coloured`` states that the extinction of the
+    medium has several channels.
     """
 
     def __init__(
-        self, scene: mi.Scene, changes: dict[mi.Emitter, tuple[object, object, str]]
+        self,
+        scene: mi.Scene,
+        changes: dict[mi.Emitter, tuple[object, object, str]],
+        is_coloured: bool,
     ) -> None:
-        self._scene, self._changes = scene, changes
+        self._scene, self._changes, self._is_coloured = scene, changes, is_coloured
         environment = scene.environment()
         self._environment = None
         if environment in changes:
@@ -45,19 +50,42 @@ class EmitterTangents:
         found = []
         pairs = zip(lights.emitters, lights.irradiance, strict=True)
         for number, (emitter, irradiance) in enumerate(pairs):
-            factor = [0.0] * dr.size_v(mi.Spectrum)
-            channel = 0
+            pairs_of_channels = [(0, 0.0)] * dr.size_v(mi.Spectrum)
             if number < lights.points and emitter in self._changes:
-                channel, factor = _relative(*self._changes[emitter])
-            factors = mi.Spectrum([dr.opaque(mi.Float, f) for f in factor])
-            found.append(factors * irradiance[channel])
+                pairs_of_channels = self._relative_by_channel(emitter)
+            found.append(
+                mi.Spectrum(
+                    [
+                        dr.opaque(mi.Float, factor) * irradiance[channel]
+                        for channel, factor in pairs_of_channels
+                    ]
+                )
+            )
         return found
+
+    def _relative_by_channel(self, emitter: mi.Emitter) -> list[tuple[int, float]]:
+        """Return, for each channel of an emitter without extent, a channel in which it emits and
+        whose radiance the medium attenuates equally, and the change relative to that channel.
+        """
+        change, value, key = self._changes[emitter]
+        brightest, factors = _relative(change, value, key)
+        if not self._is_coloured:
+            return [(brightest, factor) for factor in factors]
+        values, changes = _by_channel(value), _by_channel(change)
+        if (changes[values <= 0] != 0).any():
+            raise IrrcacheError(
+                f'irrcache: dr.forward from "{key}" in coloured extinction needs positive values '
+                f"in all channels that change, not {values}; start with small positive ones, or "
+                "use dr.backward."
+            )
+        relative = changes / np.where(values > 0, values, 1)
+        return list(enumerate(relative.tolist()))
 
     def incoming(self, transport: AdjointTransport) -> np.ndarray | None:
         """Return the changes (n, 2, channels) of the irradiance that enters along the ordinates;
         None if there are none.
         """
-        suns = [e for e in self._scene.emitters() if kind_of(e) is EmitterKind.SUN]
+        suns = EmittersByKind(illuminating(self._scene)).of(EmitterKind.SUN)
         if self._environment is None and not any(sun in self._changes for sun in suns):
             return None
         directions, incoming, *_ = transport.ordinates
@@ -115,9 +143,9 @@ def _like(environment: mi.Emitter, values: np.ndarray) -> mi.Emitter:
 
 def _relative(change: object, value: object, key: str) -> tuple[int, list[float]]:
     """Return the brightest channel of an emitter, and changes of all, relative to that channel."""
-    count = dr.size_v(mi.Spectrum)
-    columns = (np.array(mi.Spectrum(dr.detach(v)), np.float64) for v in (value, change))
-    values, changes = (column.reshape(count, -1)[:, 0] for column in columns)
+    if dr.is_tensor_v(value):
+        refuse(key, "dr.forward was called from a texture")
+    values, changes = _by_channel(value), _by_channel(change)
     channel = int(values.argmax())
     if values[channel] <= 0:
         raise IrrcacheError(
@@ -125,3 +153,9 @@ def _relative(change: object, value: object, key: str) -> tuple[int, list[float]
             "start with a small positive one, or use dr.backward."
         )
     return channel, (changes / values[channel]).tolist()
+
+
+def _by_channel(value: object) -> np.ndarray:
+    """Return the values of a number or colour by channel."""
+    columns = np.array(mi.Spectrum(dr.detach(value)), np.float64)
+    return columns.reshape(dr.size_v(mi.Spectrum), -1)[:, 0]

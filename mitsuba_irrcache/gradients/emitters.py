@@ -167,6 +167,7 @@ def _add_sun(emitter: mi.Emitter, adjoint: np.ndarray) -> None:
 
 def pull(value: mi.Spectrum, adjoint: mi.Spectrum) -> None:
     """Accumulate derivatives of ``value . adjoint`` in the parameters that ``value`` depends on."""
-    if dr.grad_enabled(value):
+    total = dr.sum(dr.dot(value, adjoint))
+    if dr.grad_enabled(total):  # not if the adjoint is a literal 0
         # Keep the edges of the AD graph: an emitter is evaluated more than once.
-        dr.backward_from(dr.sum(dr.dot(value, adjoint)), flags=dr.ADFlag.ClearVertices)
+        dr.backward_from(total, flags=dr.ADFlag.ClearVertices)

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.gradients.scattering import Components, IsotropicScattering, OrdinatePart
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
+from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind, illuminating
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor, VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
@@ -38,7 +38,7 @@ class LightsOfOneDirection:
         illumination: DistantIllumination,
     ) -> None:
         self._scattering = scattering
-        suns = EmittersByKind(scene.emitters()).of(EmitterKind.SUN)
+        suns = EmittersByKind(illuminating(scene)).of(EmitterKind.SUN)
         self.points = len(illumination.point_lights)
         self.emitters = [*illumination.point_lights, *suns]
         voxels = dr.arange(mi.UInt32, grid.voxel_count)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +26,13 @@ class Placement:
 
     def __init__(self, emitter: mi.Emitter) -> None:
         self.emitter = emitter
+
+
+class SharedTexture:
+    """The role of a texture on which several emitters or BSDFs, the ``users``, depend."""
+
+    def __init__(self, users: Sequence[mi.Object]) -> None:
+        self.users = tuple(users)
 
 
 def enabled(params: Mapping) -> list[str]:
@@ -73,6 +80,8 @@ def roles_of(
             roles[key] = Placement(node)
         else:
             roles[key] = role_of(params, key, nodes)
+            if isinstance(roles[key], SharedTexture):
+                refuse(key, "several emitters depend on it; give each a texture of its own")
     return roles
 
 
@@ -108,13 +117,26 @@ def nodes_of_medium(
     return nodes
 
 
-def nodes_of_emitters(scene: mi.Scene) -> dict[mi.Object, mi.Emitter]:
+def nodes_of_emitters(scene: mi.Scene) -> dict[mi.Object, mi.Emitter | SharedTexture]:
     """Return the emitters of ``scene`` and the textures of their radiance."""
-    nodes: dict[mi.Object, mi.Emitter] = {}
+    nodes: dict[mi.Object, object] = {}
     for emitter in scene.emitters():
-        nodes[emitter] = emitter
-        nodes |= {node: emitter for name, node in children(emitter).items() if name in RADIANCE}
+        textures = (node for name, node in children(emitter).items() if name in RADIANCE)
+        for node in (emitter, *textures):
+            add_user(nodes, node, emitter)
     return nodes
+
+
+def add_user(nodes: dict[mi.Object, object], node: mi.Object, user: mi.Object) -> None:
+    """Add to ``nodes`` that an emitter or BSDF depends on the texture ``node``."""
+    others = users_of(nodes[node]) if node in nodes else ()
+    if user not in others:
+        nodes[node] = SharedTexture([*others, user]) if others else user
+
+
+def users_of(role: object) -> tuple[object, ...]:
+    """Return the emitters and BSDFs that depend on a texture with this ``role``."""
+    return role.users if isinstance(role, SharedTexture) else (role,)
 
 
 def key_of_node(

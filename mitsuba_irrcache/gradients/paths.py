@@ -216,11 +216,13 @@ class PathAdjoint:
             self._segments.append(segment)
             total += segment.gathered() + segment.emitted + segment.escaped
             active = active & segment.end.is_valid()
-            vertex, ray, weight, density, active, rng = self._scatter(segment, number, active, rng)
-            origin = mi.Interaction3f(segment.end)
+            arrival = origin, density
+            vertex, ray, weight, (origin, density), active, rng = self._scatter(
+                segment, number, arrival, active, rng
+            )
             self._vertices.append(vertex)
             total += vertex.direct
-            dr.eval(total, ray, weight, density, active, rng)
+            dr.eval(total, ray, weight, origin, density, active, rng)
             if not dr.any(active):
                 break
         return total
@@ -249,9 +251,10 @@ class PathAdjoint:
         shadow = mi.Ray3f(origin.spawn_ray_to(record.p))
         shadow.d = record.d
         shadow.maxt = dr.largest(mi.Float)
-        open_ = active & is_open(self._scene, mi.Ray3f(origin.spawn_ray_to(record.p)), active)
-        through = self._media.transmittance(shadow, record.dist, open_)
-        return record, emitter, shadow, dr.select(open_, through, 0)
+        passed = null_transmission(self._scene, mi.Ray3f(origin.spawn_ray_to(record.p)), active)
+        visible = active & (dr.max(passed) > 0)
+        through = self._media.transmittance(shadow, record.dist, visible)
+        return record, emitter, shadow, dr.select(visible, passed * through, 0)
 
     def _segment(
         self,
@@ -263,7 +266,7 @@ class PathAdjoint:
         alpha: mi.Float | None,
     ) -> _Segment:
         origin, density, is_first = arrival
-        end, distance = next_solid(self._scene, ray, active)
+        end, distance = next_solid(self._scene, ray, active, is_first and self._hides)
         spans = self._media.spans(ray, distance, active)
         dr.eval(end, distance, spans)
         scattered, before, through = self._media.march(ray, spans, offset)
@@ -288,9 +291,13 @@ class PathAdjoint:
         )  # fmt: skip
 
     def _scatter(
-        self, segment: _Segment, number: int, active: mi.Bool, rng: mi.PCG32
-    ) -> tuple[_Vertex, mi.Ray3f, mi.Spectrum, mi.Float, mi.Bool, mi.PCG32]:
-        """Scatter paths at the end of a segment; return the vertex and the next segment."""
+        self, segment: _Segment, number: int, arrival: tuple, active: mi.Bool, rng: mi.PCG32
+    ) -> tuple[_Vertex, mi.Ray3f, mi.Spectrum, tuple, mi.Bool, mi.PCG32]:
+        """Scatter paths at the end of a segment.
+
+        ``arrival`` is the position where the path last chose a direction, and its density. Returns
+        the vertex, and ray, weight and ``arrival`` of the next segment.
+        """
         si, bsdf = segment.end, segment.end.bsdf()
         arriving = segment.weight * segment.through
         context = mi.BSDFContext()
@@ -306,7 +313,11 @@ class PathAdjoint:
         )
         found, factor = bsdf.sample(context, si, choice, sample, active)
         weight = arriving * factor
+        # Emitters were sampled through null interfaces from where the path chose its direction.
+        is_straight = mi.has_flag(found.sampled_type, mi.BSDFFlags.Null)
         density = dr.select(mi.has_flag(found.sampled_type, mi.BSDFFlags.Delta), 0, found.pdf)
+        density = dr.select(is_straight, arrival[1], density)
+        origin = dr.select(is_straight, arrival[0], mi.Interaction3f(si))
         active = active & (dr.max(dr.abs(weight)) > 0)
         chance = mi.Float(1)
         if number >= ROULETTE_AFTER:
@@ -323,7 +334,7 @@ class PathAdjoint:
         weight = dr.select(active, weight / chance, 0)
         ray = mi.Ray3f(si.spawn_ray(si.to_world(found.wo)))
         dr.eval(vertex.direct, vertex.emitter, vertex.shadow, vertex.scattering)
-        return vertex, ray, weight, density, active, rng
+        return vertex, ray, weight, (origin, density), active, rng
 
     def largest(self) -> float:
         """Return an upper bound of the weighted radiance that any part of a path has ahead."""
@@ -423,9 +434,9 @@ def power_heuristic_or_one(record: mi.DirectionSample3f, other: mi.Float) -> mi.
 
 
 @symbolic
-def next_solid(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
+def next_solid(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, hides_emitters: bool = False):
     """Return the first surface along rays that is more than the boundary of a medium, and the
-    distance to it (infinite if there is none).
+    distance to it (infinite if there is none). Rays pass emitters if these are hidden.
     """
     si, ahead, active = dr.zeros(mi.SurfaceInteraction3f), mi.Ray3f(ray), mi.Bool(active)
     found, crossings = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d)), mi.UInt32(0)
@@ -434,6 +445,8 @@ def next_solid(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
     while dr.hint(active, label="next surface"):
         si = scene.ray_intersect(ahead, active)
         solid = active & si.is_valid() & is_solid(si)
+        if dr.hint(hides_emitters, mode="scalar"):
+            solid &= si.shape.emitter() == None  # noqa: E711
         found = dr.select(solid, si, found)
         ahead = si.spawn_ray(ahead.d)
         crossings += 1
@@ -443,15 +456,18 @@ def next_solid(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
 
 
 @symbolic
-def is_open(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
-    """Return whether no surface but boundaries of media is between the ends of rays."""
-    ahead, active, result = mi.Ray3f(ray), mi.Bool(active), mi.Bool(active)
+def null_transmission(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
+    """Return the share of the radiance that passes the surfaces between the ends of rays without
+    changing its direction, as in `transport.path.visibility`; 0 where not ``active``.
+    """
+    ahead, active, result = mi.Ray3f(ray), mi.Bool(active), mi.Spectrum(1)
+    result = dr.select(active, result, 0)
     target, crossings = ray(ray.maxt), mi.UInt32(0)
     while dr.hint(active, label="to an emitter"):
         si = scene.ray_intersect(ahead, active)
         hit = active & si.is_valid()
-        result &= ~(hit & is_solid(si))
+        result = dr.select(hit, result * si.bsdf().eval_null_transmission(si, hit), result)
         ahead = si.spawn_ray_to(target)
         crossings += 1
-        active &= hit & result & (crossings < MOST_CROSSINGS)
-    return result
+        active &= hit & (dr.max(result) > 0) & (crossings < MOST_CROSSINGS)
+    return dr.select(crossings < MOST_CROSSINGS, result, 0)

@@ -10,11 +10,13 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import concatenated
+from mitsuba_irrcache.gradients.beams import check_beams
 from mitsuba_irrcache.gradients.film import FilmAdjoint
 from mitsuba_irrcache.gradients.medium import field_of
 from mitsuba_irrcache.gradients.parameters import (
     ALBEDO,
     SIGMA_T,
+    add_user,
     by_parameter,
     channels_of,
     key_of_node,
@@ -24,6 +26,7 @@ from mitsuba_irrcache.gradients.parameters import (
     refuse_all,
     role_of,
     shaped_like,
+    users_of,
 )
 from mitsuba_irrcache.gradients.replay import CameraSplats
 from mitsuba_irrcache.gradients.surroundings import LANES, CoupledMedium, Surroundings
@@ -80,6 +83,7 @@ def _check_medium(part: CachedMedium, keys: list[str]) -> None:
         refuse_all(keys, f'the solver is "{part.solver.name}"', "Set solver to sweep")
     if part.cache.voxel_classes is not None:
         refuse_all(keys, f"a surface reaches into {name}", "Move it out")
+    check_beams(part, keys)
     for light in part.description.emitters.of(*POINT_LIKE):
         if lies_in(light, part.cache.grid):
             refuse_all(keys, f'emitter "{light.id()}" is in {name} {among}', "Move it out")
@@ -158,11 +162,8 @@ class TracedAdjoint:
             CoupledMedium(self._scene, part, own, self._step, self._seed)
             for part, own in zip(self._parts, wanted, strict=True)
         ]
-        roles = self._roles.values()
-        kinds = (
-            any(isinstance(role, mi.Emitter) for role in roles),
-            any(isinstance(role, mi.BSDF) for role in roles),
-        )
+        users = [user for role in self._roles.values() for user in users_of(role)]
+        kinds = tuple(any(isinstance(u, kind) for u in users) for kind in (mi.Emitter, mi.BSDF))
         return Surroundings(self._scene, media, self._hides, kinds, self._seed)
 
     def _by_parameters(self, splats: list[CameraSplats]) -> dict[str, object]:
@@ -184,7 +185,7 @@ def roles_among(
     """Return the role of each of the parameters ``keys``, by key.
 
     A role is the number of one of the ``media`` with `SIGMA_T` or `ALBEDO`; the emitter whose
-    radiance the parameter is; or the diffuse BSDF whose reflectance it is.
+    radiance the parameter is; the diffuse BSDF whose reflectance it is; or a `SharedTexture`.
 
     Raises IrrcacheError for any other parameter.
     """
@@ -197,10 +198,12 @@ def roles_among(
             nodes[node] = number, role
     for shape in scene.shapes():
         if shape.bsdf() is not None:
-            nodes |= _reflectances(shape.bsdf())
+            for node, bsdf in _reflectances(shape.bsdf()).items():
+                add_user(nodes, node, bsdf)
     roles = {key: role_of(params, key, nodes) for key in keys}
     for key, role in roles.items():
-        if isinstance(role, mi.BSDF) and not float(np.min(np.array(params[key]))) > 0:
+        reflects = any(isinstance(user, mi.BSDF) for user in users_of(role))
+        if reflects and not float(np.min(np.array(params[key]))) > 0:
             refuse(key, "it is 0 somewhere, where paths end; start with a small positive value")
     return roles
 

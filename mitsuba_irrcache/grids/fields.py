@@ -84,6 +84,44 @@ class GridField:
 
 Field = ConstantField | GridField
 
+#: Difference of neighbouring voxels, over the maximum, from which on their interpolation matters.
+DIFFERENT = 1e-3
+
+
+def positions_between_voxels(field: Field, count: int) -> mi.Point3f | None:
+    """Return ``count`` random world positions between neighbouring voxels of different values; None
+    if there are none.
+
+    Voxels at opposite faces of a grid count as neighbours, so that a ``wrap_mode`` can be found out
+    at these positions.
+    """
+    if field.grid is None:
+        return None
+    grid, least = field.grid, dr.opaque(mi.Float, DIFFERENT * field.maximum)
+    sides = [mi.UInt32(n) for n in grid.sides]
+    index, strides = dr.arange(mi.UInt32, grid.voxel_count), (1, sides[0], sides[0] * sides[1])
+    differs = mi.Bool(False)
+    for i, n, stride in zip(grid.voxel_indices(index), sides, strides, strict=True):
+        neighbour = dr.select(i + 1 < n, index + stride, index + stride - stride * n)
+        for channel in range(field.channels):
+            own, other = (
+                dr.gather(mi.Float, field.data, k * field.channels + channel)
+                for k in (index, neighbour)
+            )
+            differs |= dr.abs(own - other) * field.scale > least
+    chosen = dr.compress(differs)
+    if not dr.width(chosen):
+        return None
+    rng = mi.PCG32(count)
+    place = mi.UInt32(rng.next_float32() * dr.opaque(mi.Float, float(dr.width(chosen))))
+    index = dr.gather(mi.UInt32, chosen, dr.minimum(place, dr.width(chosen) - 1))
+    u = mi.Point3f(*grid.voxel_indices(index)) + 0.5
+    u += mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+    size = mi.Point3f(*(mi.Float(n) for n in grid.sides))
+    u = dr.select(u > size, u - size, u)
+    dr.eval(u)
+    return grid.world.point(u)
+
 
 #: Largest error of interpolation by the texture units of GPUs, whose weights have 8 bits, relative
 #: to the range of the voxels between which they interpolate; 0.0068 was measured.

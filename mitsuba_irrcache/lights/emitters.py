@@ -172,14 +172,28 @@ def _check_shape(emitter: mi.Emitter) -> None:
         )
 
 
+def illuminating(scene: mi.Scene) -> list[mi.Emitter]:
+    """Return the emitters that illuminate a scene: all but those without extent, or in a single
+    direction, whose ``sampling_weight`` is 0, because no integrator's paths can reach these.
+    """
+    return [emitter for emitter in scene.emitters() if not is_never_sampled(emitter)]
+
+
+def is_never_sampled(emitter: mi.Emitter) -> bool:
+    """Return whether no path can reach an emitter: it has to be sampled, with probability 0."""
+    if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta):
+        return False
+    return not np.any(np.array(mi.traverse(emitter).get("sampling_weight", 1.0)))
+
+
 def point_lights(scene: mi.Scene) -> list[mi.Emitter]:
     """Return the emitters of a scene that have a finite position and no extent."""
-    return EmittersByKind(scene.emitters()).of(*POINT_LIKE)
+    return EmittersByKind(illuminating(scene)).of(*POINT_LIKE)
 
 
 def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
     """Return the point-like emitters of a scene whose intensity depends on the direction."""
-    return EmittersByKind(scene.emitters()).of(*SPOT_LIKE)
+    return EmittersByKind(illuminating(scene)).of(*SPOT_LIKE)
 
 
 def position_of(emitter: mi.Emitter) -> np.ndarray:

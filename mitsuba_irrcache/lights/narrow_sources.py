@@ -13,7 +13,12 @@ import numpy as np
 
 from mitsuba_irrcache.core.sequences import GOLDEN_STEP, lattice_points
 from mitsuba_irrcache.errors import UnsupportedSceneError
-from mitsuba_irrcache.lights.emitters import EmitterKind, emits_in_one_direction, kind_of
+from mitsuba_irrcache.lights.emitters import (
+    EmitterKind,
+    emits_in_one_direction,
+    illuminating,
+    kind_of,
+)
 
 #: Maximum sine of the angular radius of a lamp that is treated as narrow.
 MAX_LAMP_SINE = 0.95
@@ -124,7 +129,7 @@ def sources_of(
     unless they have a single direction.
     """
     found, others, lamps = [], [], []
-    for emitter in scene.emitters():
+    for emitter in illuminating(scene):
         kind, parts = kind_of(emitter), others if emitter in known else found
         if emits_in_one_direction(emitter):
             parts.append(Source(_sampled(emitter).d.numpy().ravel(), MIN_ANGULAR_RADIUS, far=True))

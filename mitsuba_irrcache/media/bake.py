@@ -10,7 +10,13 @@ import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import Boundary
-from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField, error_of_texture_units
+from mitsuba_irrcache.grids.fields import (
+    ConstantField,
+    Field,
+    GridField,
+    error_of_texture_units,
+    positions_between_voxels,
+)
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.media.phase import phase_of
@@ -161,14 +167,24 @@ def _clipping_box(volume: mi.Volume, boundary: Boundary) -> tuple[np.ndarray, np
 
 
 def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
-    """Compare the converted fields with the coefficients that Mitsuba evaluates at random points.
+    """Compare the converted fields with the coefficients that Mitsuba evaluates at random points,
+    anywhere in the medium and between voxels that differ.
 
     This detects properties of volumes that cannot be queried, such as the filter type "nearest" and
     the wrap mode "repeat", which would otherwise be rendered wrongly.
     """
     rng = mi.PCG32(VERIFIED)
     frame = Grid((1, 1, 1), grid.frame)
-    p = frame.world.point(mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32()))
+    u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+    _compare(medium, grid, name, frame.world.point(u))
+    for field in (grid.sigma_t, grid.albedo):
+        p = positions_between_voxels(field, VERIFIED)
+        if p is not None:
+            _compare(medium, grid, name, p)
+
+
+def _compare(medium: mi.Medium, grid: MediumGrid, name: str, p: mi.Point3f) -> None:
+    """Raise UnsupportedSceneError if Mitsuba evaluates other coefficients at positions ``p``."""
     interaction = dr.zeros(mi.MediumInteraction3f, VERIFIED)
     interaction.p = p
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(interaction, True)

@@ -7,7 +7,12 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.grids.fields import ConstantField, Field, error_of_texture_units
+from mitsuba_irrcache.grids.fields import (
+    ConstantField,
+    Field,
+    error_of_texture_units,
+    positions_between_voxels,
+)
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.bake import baked_field, volume_error
 from mitsuba_irrcache.media.emission import Emission
@@ -60,15 +65,21 @@ def _numbers(value: object, scale: float) -> np.ndarray:
 
 
 def _verify(volume: mi.Volume, field: Field, scale: float) -> None:
-    """Compare converted values with those that Mitsuba evaluates inside of the volume."""
+    """Compare converted values with those that Mitsuba evaluates inside of the volume, anywhere and
+    between voxels that differ.
+    """
     if field.grid is None or not field.maximum > 0:
         return
     rng = mi.PCG32(512)
     u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-    interaction = dr.zeros(mi.Interaction3f, 512)
-    interaction.p = Grid((1, 1, 1), field.grid.to_world).world.point(u)
-    theirs = mi.Spectrum(volume.eval(interaction)) * scale
-    apart = dr.abs(theirs - mi.Spectrum(field.at_world(interaction.p)))
-    apart -= error_of_texture_units(field, interaction.p)
-    if dr.max(dr.max(apart))[0] > TOLERANCE * field.maximum:
-        raise volume_error("emission of the integrator")
+    anywhere = Grid((1, 1, 1), field.grid.to_world).world.point(u)
+    for p in (anywhere, positions_between_voxels(field, 512)):
+        if p is None:
+            continue
+        interaction = dr.zeros(mi.Interaction3f, 512)
+        interaction.p = p
+        theirs = mi.Spectrum(volume.eval(interaction)) * scale
+        apart = dr.abs(theirs - mi.Spectrum(field.at_world(p)))
+        apart -= error_of_texture_units(field, p)
+        if dr.max(dr.max(apart))[0] > TOLERANCE * field.maximum:
+            raise volume_error("emission of the integrator")

@@ -15,7 +15,7 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
 from mitsuba_irrcache.grids.fields import ConstantField
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.lights.emitters import EmitterKind, illuminating, kind_of
 from mitsuba_irrcache.machine.memory import available_memory
 from mitsuba_irrcache.machine.versions import DISTRIBUTION, installed_version
 from mitsuba_irrcache.media.medium import MediumGrid, axis_aligned
@@ -230,7 +230,7 @@ def _only_medium(scene: mi.Scene, description: SceneDescription) -> MediumGrid:
         _refuse(f"{name} fills a {medium.boundary.kind} and not a box")
     if medium.sigma_t.channels != 1:
         _refuse(f"the extinction of {name} is coloured")
-    for emitter in scene.emitters():
+    for emitter in illuminating(scene):
         kind = kind_of(emitter)
         if kind not in EMITTERS:
             _refuse(f'emitter "{emitter.id()}" ({emitter.class_name()}) is not far away')

@@ -214,7 +214,8 @@ class ClosedFormCameraRays:
         # As in volpath, a sensor is inside the medium only if the scene says so, and rays enter
         # through the boundary, even if the grid covers only a part of it.
         _, entry, leave = self.medium.boundary.intersect(ray)
-        entered = entry > -1e-5 * (leave - entry)
+        # The far plane ends rays only before their first intersection.
+        entered = (entry > -1e-5 * (leave - entry)) & (entry < ray.maxt)
         hit &= (far > 0) if medium is not None else entered
         return hit, dr.maximum(near, 0), far
 

@@ -14,6 +14,9 @@ from mitsuba_irrcache.transport.path import medium_after, sample_bsdf
 
 #: Maximum number of reflected paths that wait, per lane.
 PLACES = 2
+#: Lobes that reflect and that transmit, without diffuse ones.
+MIRROR = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.GlossyReflection)
+CLEAR = int(mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.Null)
 #: Throughput of either path below which one of both is chosen at random instead.
 NEGLIGIBLE = 2e-3
 
@@ -46,14 +49,11 @@ def split(
     """
     found = sample_bsdf(si, *samples, active)
     pointer, throughput, eta, vertex = state
-    kinds = mi.BSDFFlags
-    mirror = int(kinds.DeltaReflection | kinds.GlossyReflection)
-    clear = int(kinds.DeltaTransmission | kinds.GlossyTransmission | kinds.Null)
     flags = si.bsdf().flags()
-    both = active & ((flags & mirror) != 0) & ((flags & clear) != 0)
-    both &= (flags & int(kinds.Diffuse)) == 0
-    transmitted = _lobe(si, samples, both, clear)
-    direction, f, scale, _, pdf = _lobe(si, samples, both, mirror)
+    both = active & ((flags & MIRROR) != 0) & ((flags & CLEAR) != 0)
+    both &= (flags & int(mi.BSDFFlags.Diffuse)) == 0
+    transmitted = _lobe(si, samples, both, CLEAR)
+    direction, f, scale, _, pdf = _lobe(si, samples, both, MIRROR)
     f = throughput * f
     # At total reflection the transmittance is 0 but for rounding, which differs between backends.
     both &= (dr.max(throughput * transmitted[1]) > NEGLIGIBLE) & (dr.max(f) > NEGLIGIBLE)
@@ -74,11 +74,15 @@ def _lobe(
     active: mi.Bool,
     lobes: int,
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool, mi.Float]:
-    """Sample some ``lobes`` as `sample_bsdf`, but return the density of all lobes: emitters are
-    sampled for all lobes, and the weights of multiple importance sampling have to sum to 1.
+    """Sample the ``lobes`` `MIRROR` or `CLEAR` as `sample_bsdf`, but return the density of all
+    lobes: emitters are sampled for all lobes, and the weights of multiple importance sampling have
+    to sum to 1.
     """
     direction, f, scale, is_vertex, density = sample_bsdf(si, *samples, active, lobes)
     wo = si.to_local(direction)
+    # Some BSDFs, such as "mask", sample lobes that were not asked for.
+    reflects = wo.z * si.wi.z > 0
+    f = dr.select(reflects if lobes == MIRROR else ~reflects, f, 0)
     glossy = active & (density > 0)
     density = dr.select(glossy, si.bsdf().pdf(mi.BSDFContext(), si, wo, glossy), 0)
     return direction, f, scale, is_vertex, density

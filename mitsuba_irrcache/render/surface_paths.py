@@ -564,6 +564,8 @@ class _PathFollower:
         path.waiting, state, new = resumed(path.waiting, state, path.active)
         path.ray, path.pointer, path.throughput, path.eta, path.last, path.pdf = state
         path.depth = dr.select(new, 1, path.depth)
+        path.share = dr.select(new, 1, path.share)
+        path.first &= ~new
         path.active |= new
 
 

@@ -18,7 +18,13 @@ from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import Boundary, boundary_of, rays_through
-from mitsuba_irrcache.lights.emitters import EmittersByKind, check_placement, kind_of
+from mitsuba_irrcache.lights.emitters import (
+    EmittersByKind,
+    check_placement,
+    illuminating,
+    is_never_sampled,
+    kind_of,
+)
 from mitsuba_irrcache.lights.environments import detail_of
 from mitsuba_irrcache.media.bake import bake, children
 from mitsuba_irrcache.media.delta_m import without_forward_peak
@@ -64,7 +70,7 @@ def compile_scene(
     integrator. Raises UnsupportedSceneError, naming the object, for scenes that would be rendered
     incorrectly.
     """
-    emitters = EmittersByKind(scene.emitters())
+    emitters = EmittersByKind(illuminating(scene))
     media = media_of(scene)
     if not media:
         if emission is not None:
@@ -116,7 +122,7 @@ def _detail(scene: mi.Scene, emission: Emission | None, max_depth: int) -> Detai
     """
     if emission is not None or max_depth == 2:
         return Detail.SHARP
-    return detail_of(scene.emitters())
+    return detail_of(illuminating(scene))
 
 
 def _holds_emitters(scene: mi.Scene, frame: np.ndarray) -> bool:
@@ -428,13 +434,12 @@ def _warn_of_coincidence(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
 
 
 def _warn_of_weight(emitter: mi.Emitter) -> None:
-    """Log a warning for an emitter that other integrators never sample."""
-    if not np.any(np.array(mi.traverse(emitter).get("sampling_weight", 1.0))):
+    """Log a warning for an emitter that is never sampled, and does not illuminate the scene."""
+    if is_never_sampled(emitter):
         mi.Log(
             mi.LogLevel.Warn,
-            f'irrcache: emitter "{emitter.id()}" has sampling_weight 0. It illuminates the scene '
-            "nevertheless, while other integrators never sample it. Set its radiance or intensity "
-            "to 0 to switch it off.",
+            f'irrcache: emitter "{emitter.id()}" has sampling_weight 0 and does not illuminate the '
+            "scene, as with Mitsuba's integrators, which never sample it.",
         )
 
 

@@ -33,6 +33,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.lights.emitters import (
     POINT_LIKE,
     EmitterKind,
+    illuminating,
     kind_of,
     point_lights,
     position_of,
@@ -91,7 +92,7 @@ def is_seen_from_outside(scene: mi.Scene, medium: MediumGrid) -> bool:
 
 def supports_emitters(scene: mi.Scene) -> bool:
     """Return whether all emitters of the scene are of the kinds ``EMITTERS``."""
-    return all(kind_of(emitter) in EMITTERS for emitter in scene.emitters())
+    return all(kind_of(emitter) in EMITTERS for emitter in illuminating(scene))
 
 
 class HalfSpace:
@@ -106,7 +107,7 @@ class HalfSpace:
     def __init__(self, scene: mi.Scene, medium: MediumGrid, max_depth: int) -> None:
         self.medium = medium
         self._environment = scene.environment()
-        self._others = [e for e in scene.emitters() if not kind_of(e).is_environment]
+        self._others = [e for e in illuminating(scene) if not kind_of(e).is_environment]
         albedo = np.broadcast_to(_channels(medium.albedo.value), (dr.size_v(mi.Spectrum),))
         self._albedo = mi.Spectrum([dr.opaque(mi.Float, float(a)) for a in albedo])
         orders = max_depth - 1 if max_depth >= 0 else 0

@@ -10,7 +10,7 @@ from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, occupied_box
-from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, illuminating, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
@@ -75,7 +75,7 @@ class SweepSolver(Solver):
         cls, scene: mi.Scene, medium: MediumGrid, max_depth: int, resolution: int
     ) -> str | None:
         name = f'medium "{medium.name}"'
-        for emitter in scene.emitters():
+        for emitter in illuminating(scene):
             if kind_of(emitter) not in EMITTERS:
                 kind = f'"{emitter.id()}" ({emitter.class_name()})'
                 return (

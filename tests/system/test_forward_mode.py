@@ -48,6 +48,7 @@ def test_both_modes_agree(mono, name):
     "name",
     [
         "coloured extinction",
+        "intensity of a point in coloured extinction",
         "alpha",
         "emission",
         "radiance of sky and sun, single",
@@ -164,3 +165,28 @@ def test_lights_without_radiance_are_refused_by_name(rgb):
     params.update()
     with pytest.raises(IrrcacheError, match=r"lamp\.intensity\.value.*positive"):
         dr.forward_to(mi.render(scene, params, spp=1))
+
+
+def test_what_has_no_change_by_channel_is_refused(rgb):
+    """Textures of emitters, and colours that change from 0 in coloured extinction."""
+    red = {"type": "rgb", "value": [1.0, 0.0, 0.0]}
+    point = {"type": "point", "position": [0.0, 3.0, 0.0], "intensity": red}
+    look = mi.ScalarTransform4f().look_at([0, 3, 0], [0, 0, 0], [1, 0, 0])
+    pixels = mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32))
+    texture = {"type": "bitmap", "bitmap": pixels, "raw": True}
+    projector = {"type": "projector", "to_world": look, "irradiance": texture}
+    for lamp, key, message in (
+        (point, "lamp.intensity.value", "in coloured extinction needs positive values"),
+        (projector, "lamp.irradiance.data", "from a texture"),
+    ):
+        coloured = (0.5, 0.8, 1.0)
+        case = Case(data=8, cache=8, extinction=coloured, emitters=lambda e=lamp: {"lamp": e})
+        scene = case.load()
+        params = mi.traverse(scene)
+        change = mi.Float(0.0)
+        dr.enable_grad(change)
+        params[key] = params[key] + type(params[key])(change)
+        params.update()
+        _image = mi.render(scene, params, spp=1)
+        with pytest.raises(IrrcacheError, match=message):
+            dr.forward_from(change)

@@ -485,7 +485,41 @@ def test_spots_whose_beams_are_narrow_are_refused(rgb, height, angle, reason):
     look = mi.ScalarTransform4f().look_at([0.1, height, 0], [0.1, -1, 0], [1, 0, 0])
     lamp = {"type": "spot", "to_world": look, "cutoff_angle": angle}
     scene = Case(data=8, cache=8, emitters=lambda: {"lamp": lamp}).load()
-    assert f'the beam of the spot "lamp" {reason}' in refused(scene, "sigma_t.data")
+    message = f'the beam of the emitter "lamp" (SpotLight) {reason}'
+    assert message in refused(scene, "sigma_t.data")
+
+
+def test_narrow_projectors_are_refused(rgb):
+    """The derivative by the radiance of one that illuminates a part of a voxel was 0."""
+    look = mi.ScalarTransform4f().look_at([0.1, 5, 0], [0.1, 0, 0], [0, 0, 1])
+    for fov, is_narrow in ((1.0, True), (40.0, False)):
+        lamp = {"type": "projector", "to_world": look, "fov": fov, "irradiance": 1.0}
+        scene = Case(data=8, cache=8, emitters=lambda e=lamp: {"lamp": e}).load()
+        if is_narrow:
+            assert 'the emitter "lamp" (Projector) is narrower' in refused(scene, "sigma_t.data")
+        else:
+            found = gradients(scene, ("sigma_t",), pixel_weights(scene), spp=1)
+            assert np.abs(found["sigma_t"]).max() > 0
+
+
+def test_narrow_beams_beside_the_medium_are_not_refused(rgb):
+    look = mi.ScalarTransform4f().look_at([4, 3, 0], [4, 0, 0], [1, 0, 0])
+    lamp = {"type": "spot", "to_world": look, "cutoff_angle": 2.0}
+    scene = Case(data=8, cache=8, emitters=lambda: {"sky": SKY, "lamp": lamp}).load()
+    found = gradients(scene, ("sigma_t",), pixel_weights(scene), spp=1)
+    assert np.abs(found["sigma_t"]).max() > 0
+
+
+def test_a_texture_of_two_emitters_is_refused(rgb):
+    """The derivative was that of one of them."""
+    texture = {"type": "uniform", "id": "both", "value": 20.0}
+    reference = {"type": "ref", "id": "both"}
+    lamps = {
+        name: {"type": "point", "position": [x, 4.0, 1.0], "intensity": reference}
+        for name, x in (("a", -1.0), ("b", 1.0))
+    }
+    scene = Case(data=8, cache=8, emitters=lambda: {"both": texture} | lamps).load()
+    assert "several emitters depend on it" in refused(scene, "both.value")
 
 
 @pytest.mark.parametrize("backwards", [True, False])

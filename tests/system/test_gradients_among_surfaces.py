@@ -36,6 +36,7 @@ def fewer_paths(monkeypatch):
         pytest.param("lamp", ("albedo", "lamp"), marks=pytest.mark.slow),
         ("two media, sky", ("sigma_t", "other.interior_medium.sigma_t")),
         ("distant object, empty voxels", ("sigma_t",)),
+        ("ground, sun through a window", ("sigma_t",)),
     ],
 )
 def test_gradients_are_those_of_the_image(mono, name, parameters):
@@ -47,6 +48,20 @@ def test_gradients_are_those_of_the_image(mono, name, parameters):
         result = compare(scene, case, parameter, weights, gradient, PERTURBATIONS)
         assert result.error < ERROR, parameter
         assert result.cosine > COSINE, parameter
+
+
+def test_hidden_lamps_do_not_hide_the_medium(mono):
+    """Camera rays pass hidden emitters; gradients were those of what is in front of them."""
+    camera = np.array([1.0, 1.5, -5.0])
+    place = mi.ScalarTransform4f().look_at(0.9 * camera, 0 * camera, [0, 1, 0]).scale(0.3)
+    lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": 1e-4}}
+    found = []
+    for objects in (distant, lambda: distant() | {"front": lamp}):
+        scene = Case(objects=objects).load(hide_emitters=True)
+        found.append(gradients(scene, ("sigma_t",), pixel_weights(scene))["sigma_t"])
+    smooth = np.array(Case().sigma_t(), dtype=np.float64)
+    alone, hidden = ((each * smooth).sum() for each in found)
+    assert hidden == pytest.approx(alone, rel=0.05)
 
 
 def test_gradients_in_colour_are_those_of_the_image(rgb):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import UnsupportedSceneError
-from tests.support.surfaces import ball, check, fog, images, lamp, placed
+from tests.support.surfaces import ball, bound, check, fog, images, lamp, placed
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -91,6 +91,23 @@ def test_scenes(scenes, build):
     depth = {"max_depth": -1, "rr_depth": 50}
     settings = {"solver": "auto", "resolution": 24}
     check(*images(scenes, build() | {"sun": None}, settings, depth, (16, 512)))
+
+
+def test_a_lamp_reflected_by_glass_before_a_medium_with_a_forward_peak(scenes):
+    """The reflected path waits until the transmitted one has crossed the medium, which attenuated
+    the lamp of the reflection: the pane was 40 % too dark.
+    """
+    plate = milk(0.04, 0.5)
+    pane = {"type": "cube", "to_world": placed((0, 0, -0.8), (1.2, 1.2, 0.2)), "bsdf": GLASS}
+    cloud = milk(2.0, 0.9, phase={"type": "hg", "g": 0.85})
+    objects = {
+        "pane": pane | {"interior": plate},
+        "cloud": bound(interior=cloud, center=(0, 0, 1.0), scale=(1.5, 1.5, 0.8)),
+        "lamp": lamp((-0.4, -0.6, -4.0), (0.2, 0.3, -1.0), 0.7),
+        "sun": None,
+    }
+    settings = {"solver": "auto", "resolution": 20}
+    check(*images(scenes, objects, settings, {"max_depth": -1, "rr_depth": 50}, (64, 1024)))
 
 
 @pytest.mark.parametrize("bsdf", [GLASS, ROUGH])

@@ -124,6 +124,23 @@ def test_cameras(scenes):
     assert both[0].integrator().cache.samples == 64
 
 
+@pytest.mark.parametrize("far", [3.0, 4.3, 100.0])
+def test_far_planes(scenes, far):
+    """Media whose boundary is beyond the far plane are not visible, as with volpath."""
+    cube = scenes.boundary(scenes.medium(1.0, 0.5))
+    settings = {"type": "irrcache", "resolution": 12, "solver": "sweep"}
+    sensor = {
+        "type": "perspective", "fov": 20, "far_clip": far,
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
+    }  # fmt: skip
+    sensor, means = mi.load_dict(sensor), []
+    for integrator, spp in ((settings, 64), ({"type": "volpath"}, 4096)):
+        scene = scenes.load(integrator, cube, 8)
+        means.append(np.array(mi.render(scene, sensor=sensor, spp=spp))[..., :3].mean())
+    assert means[0] == pytest.approx(means[1], rel=0.01)
+
+
 def test_radiance_and_irradiance_meters(scenes):
     """Radiance and irradiance meters agree with volpath.
 

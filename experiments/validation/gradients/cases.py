@@ -257,6 +257,12 @@ def ground(reflectance: object = 0.5) -> dict:
     return {"floor": {"type": "rectangle", "to_world": place, "bsdf": bsdf}}
 
 
+def window() -> dict:
+    """A thin pane of glass above the medium, which passes a part of the light unscattered."""
+    place = mi.ScalarTransform4f().translate([0, 2.0, 0]).rotate([1, 0, 0], 90).scale(6)
+    return {"pane": {"type": "rectangle", "to_world": place, "bsdf": {"type": "thindielectric"}}}
+
+
 def distant() -> dict:
     """A small object far from the medium, so that rays are traced."""
     return {"far": {"type": "sphere", "center": [0, -3.0, 0], "radius": 0.05}}
@@ -311,6 +317,9 @@ def surrounded() -> dict[str, Case]:
             emitters=_under(sky=SKY, sun=SUN),
             objects=lambda: ground(colour),
             parameters=(*both, "floor", "sky", "sun"),
+        ),
+        "ground, sun through a window": Case(
+            emitters=_under(sun=SUN), objects=lambda: ground() | window()
         ),
         "ground, point": Case(emitters=_under(point=POINT), objects=ground),
         "distant object, empty voxels": Case(
@@ -381,6 +390,9 @@ CASES = {
         emitters=_under(sky=SKY, sun=SUN), parameters=("sky", "sun"), max_depth=2
     ),
     "intensity of a point": Case(emitters=_under(point=POINT), parameters=("point",)),
+    "intensity of a point in coloured extinction": Case(
+        emitters=_under(point=POINT), extinction=(0.3, 0.6, 1.5), parameters=("point",)
+    ),
     "texels of an envmap": Case(emitters=lambda: {"sky": sky_with_sun()}, parameters=("sky",)),
     "emission": Case(emissive=True, empty_beyond=0.5, parameters=("emission",)),
     "emission, single": Case(

@@ -17,7 +17,7 @@ import numpy as np
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.core.sequences import kronecker_steps, lattice_points
 from mitsuba_irrcache.errors import UnsupportedSceneError
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.lights.emitters import EmitterKind, illuminating, kind_of
 from mitsuba_irrcache.lights.environments import (
     environment_radiance,
     exceeds_even_ordinates,
@@ -77,7 +77,7 @@ class DistantIllumination:
         self._samples_per_pair = samples if self._is_sampled(only_bright) else 0.0
         self._bright_regions: tuple | None = None
         self._suns, self.point_lights = [], []
-        for emitter in scene.emitters():
+        for emitter in illuminating(scene):
             kind = kind_of(emitter)
             if kind is EmitterKind.SUN:
                 self._suns.append(_sun(emitter))

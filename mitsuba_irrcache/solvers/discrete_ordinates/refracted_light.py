@@ -15,7 +15,7 @@ import numpy as np
 from mitsuba_irrcache.core.jit import Divisor
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream, unit_floats
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.lights.emitters import EmitterKind, illuminating, kind_of
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
 from mitsuba_irrcache.transport.path import flags_of
 from mitsuba_irrcache.transport.path_tracer import PathStart
@@ -37,7 +37,7 @@ def is_needed(scene: mi.Scene) -> bool:
     """
     rough = int(mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission)
     scatters = any(flags_of(shape) & rough for shape in scene.shapes())
-    kinds = (kind_of(emitter) for emitter in scene.emitters())
+    kinds = (kind_of(emitter) for emitter in illuminating(scene))
     return any(
         scatters or not (kind.has_one_direction or kind.is_point_like)
         for kind in kinds

@@ -25,6 +25,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import occupied_box
+from mitsuba_irrcache.lights.emitters import is_never_sampled
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import hole_in
@@ -260,6 +261,7 @@ class _Estimator:
             i
             for i, emitter in enumerate(scene.emitters())
             if all(light.emitter != emitter for light in cache.direct_lights)
+            and not is_never_sampled(emitter)
         ]
         self._sampled = None
         if self._excluded:

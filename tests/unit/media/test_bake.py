@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
+from mitsuba_irrcache.media.bake_emission import bake_emission
 from mitsuba_irrcache.scene.compile import compile_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -143,6 +144,21 @@ def test_a_dense_voxel_does_not_hide_another_filter(scenes, name):
     with pytest.raises(UnsupportedSceneError, match="trilinear"):
         baked(scenes, medium)
     baked(scenes, scenes.medium(*fields.values(), box))
+
+
+@pytest.mark.parametrize("option", [{"filter_type": "nearest"}, {"wrap_mode": "repeat"}])
+def test_other_interpolation_of_few_voxels_is_refused(scenes, option):
+    """Random points miss a few voxels in many; images had the values of trilinear volumes."""
+    box = scenes.placement()
+    sparse = np.zeros((64, 64, 64), np.float32)
+    sparse[0, 31, 31:33] = 20.0
+    usual = scenes.medium(sparse, 0.5, box)
+    baked(scenes, usual)
+    with pytest.raises(UnsupportedSceneError, match="does not interpolate as expected"):
+        baked(scenes, usual | {"sigma_t": scenes.volume(sparse, box, **option)})
+    bake_emission(mi.load_dict(scenes.volume(sparse, box)), 1.0)
+    with pytest.raises(UnsupportedSceneError, match="does not interpolate as expected"):
+        bake_emission(mi.load_dict(scenes.volume(sparse, box, **option)), 1.0)
 
 
 def test_mono_takes_the_luminance(mono, scenes):

@@ -103,6 +103,26 @@ def test_emitters_that_are_never_sampled_are_noted(scenes, logged, weight, expec
     assert all('"lamp"' in text for text in found)
 
 
+@pytest.mark.parametrize("solver", ["sweep", "path"])
+@pytest.mark.parametrize("max_depth", [2, -1])
+def test_emitters_that_are_never_sampled_do_not_illuminate(scenes, solver, max_depth):
+    """As with Mitsuba's integrators; solvers disagreed about them."""
+    look = mi.ScalarTransform4f().look_at([0, 3, 0], [0, 0, 0], [1, 0, 0])
+    emitters = {
+        "a": {"type": "point", "position": [2, 0, 0], "intensity": 50.0},
+        "b": {"type": "spot", "to_world": look, "intensity": 50.0},
+        "c": {"type": "directional", "direction": [0, -1, 0], "irradiance": 50.0},
+    }
+    never = {name: emitter | {"sampling_weight": 0.0} for name, emitter in emitters.items()}
+    settings = {"type": "irrcache", "resolution": 8, "solver": solver, "max_depth": max_depth}
+    shape = scenes.boundary(scenes.medium(1.0, 0.5))
+    with_them, without = (
+        np.array(mi.render(scenes.load(settings, shape, 8, **more), spp=16, seed=1))
+        for more in (never, {})
+    )
+    np.testing.assert_allclose(with_them, without, rtol=1e-5, atol=1e-6)
+
+
 def test_shapes_without_sampled_positions_are_described(scenes):
     """Mitsuba samples no positions on instances and signed distance fields."""
     beside = mi.ScalarTransform4f().translate([3, 0, 0])
