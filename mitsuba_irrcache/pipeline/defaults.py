@@ -54,17 +54,34 @@ def choose_solver(
     """Choose the solver for a ``medium`` of a scene; also return the reason.
 
     ``solver`` is a name, or ``auto`` for the first one, by `Solver.precedence`, that supports the
-    medium. Raises IrrcacheError if the named solver does not support it, or if none does.
+    medium and is accurate. Raises IrrcacheError if the named solver does not support it, or if none
+    does.
     """
     candidates = registered() if solver == "auto" else (solver_named(solver),)
-    reasons = []
+    reasons, inaccurate = [], []
     for candidate in candidates:
         reason = candidate.why_not(scene, medium, max_depth, resolution)
-        if reason is None:
+        if (
+            reason is None
+            and inaccurate
+            and medium.phase.forward
+            and not candidate.supports_delta_m
+        ):
+            continue
+        weakness = candidate.weakness(scene, medium, max_depth) if reason is None else None
+        if reason is None and weakness is None:
             chosen = candidate
             break
-        reasons.append(reason)
+        if weakness is not None:
+            inaccurate.append((candidate, weakness))
+        reasons.append(reason or weakness)
     else:
+        chosen = None
+    if chosen is None and inaccurate:
+        chosen, weakness = inaccurate[0]
+        _warn_of_weakness(medium, chosen, weakness)
+        reasons = []
+    if chosen is None:
         names = " nor ".join(f'"{candidate.name}"' for candidate in candidates)
         raise IrrcacheError(
             f"irrcache: solver {names} cannot be used in this scene, since "
@@ -75,6 +92,16 @@ def choose_solver(
     if medium.phase.forward:
         _check_forward_peak(medium, chosen, reason, max_depth)
     return chosen, reason
+
+
+def _warn_of_weakness(medium: MediumGrid, solver: type[Solver], weakness: str) -> None:
+    """Log that a solver is inaccurate in this scene, and no other one is used."""
+    remedy = "" if medium.phase.forward else ', or set solver to "path"'
+    mi.Log(
+        mi.LogLevel.Warn,
+        f'irrcache: solver "{solver.name}" is inaccurate for medium "{medium.name}", since '
+        f"{weakness}: the image depends on cache_seed. Raise cache_spp{remedy}.",
+    )
 
 
 def _check_forward_peak(

@@ -54,6 +54,9 @@ LARGEST_OFFSET = 0.002
 #: Number of points on a surface, their largest distance from a face of the boundary of a medium
 #: over the edge of the box, and their smallest share, for which both are said to coincide.
 COINCIDENCE_POINTS, COINCIDENT, COINCIDENT_SHARE = 256, 1e-5, 0.1
+#: Relative difference of the cosines of face normals and interpolated normals of an emissive mesh,
+#: averaged over its area, above which a warning is logged.
+MOST_LOST = 0.02
 #: Shapes with flat parts, besides meshes; others, such as instances, need not sample positions.
 FLAT = ("Rectangle", "Disk")
 #: Minimum number of distinct single-precision coordinates within a side of a medium, and within a
@@ -84,6 +87,7 @@ def compile_scene(
     for emitter in scene.emitters():
         check_placement(emitter)
         _warn_of_weight(emitter)
+        _warn_of_normals(emitter)
     for sensor in scene.sensors():
         check_sensor(scene, sensor)
     boundary = _boundary_without_surfaces(scene, media)
@@ -440,6 +444,36 @@ def _warn_of_weight(emitter: mi.Emitter) -> None:
             mi.LogLevel.Warn,
             f'irrcache: emitter "{emitter.id()}" has sampling_weight 0 and does not illuminate the '
             "scene, as with Mitsuba's integrators, which never sample it.",
+        )
+
+
+def _warn_of_normals(emitter: mi.Emitter) -> None:
+    """Log a warning for an emissive mesh with interpolated normals: Mitsuba samples its emission by
+    the cosine of these normals, and emits by those of the faces if rays hit it.
+    """
+    shape = emitter.get_shape()
+    if shape is None or not shape.is_mesh() or not shape.has_vertex_normals():
+        return
+    params = mi.traverse(shape)
+    if "vertex_normals" not in params or not len(params["vertex_normals"]):
+        return
+    corners, normals = (
+        np.array(params[key], dtype=np.float64).reshape(-1, 3)
+        for key in ("vertex_positions", "vertex_normals")
+    )
+    faces = np.array(params["faces"]).reshape(-1, 3)
+    a, b, c = (corners[faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    areas = np.linalg.norm(across, axis=1)
+    cosines = np.einsum("ij,ikj->ik", across, normals[faces]).mean(axis=1)
+    lost = 1 - cosines.sum() / max(areas.sum(), 1e-300)
+    if lost > MOST_LOST:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"irrcache: {described(shape)} is an emitter with interpolated vertex normals, which "
+            f"differ from those of its faces (by a mean cosine of {1 - lost:.2g}). Mitsuba samples "
+            "its emission by the former, which rays that hit it do not: volpath is inconsistent, "
+            'and solver "sweep" uses the latter. Set face_normals to true.',
         )
 
 

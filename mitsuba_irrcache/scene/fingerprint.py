@@ -159,6 +159,8 @@ class _Kept:
 
 def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
     """Return an immutable, comparable form of ``value``; ``previous`` if it is unchanged."""
+    if value is None:  # unset parameters, such as those of "hair"
+        return repr(value)
     if dr.is_jit_v(value):
         if dr.is_tensor_v(value):
             parts, shape = (value.array,), value.shape
@@ -172,7 +174,7 @@ def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
         if len(known) != len(parts):
             known = (None,) * len(parts)
         return shape, tuple(_kept(p, k, budget) for p, k in zip(parts, known, strict=True))
-    if isinstance(value, (bool, int, float, str, type(None))):
+    if isinstance(value, (bool, int, float, str)):
         return repr(value)  # in this form NaN is equal to itself
     if isinstance(value, mi.Object):
         return value

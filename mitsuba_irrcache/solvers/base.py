@@ -100,6 +100,14 @@ class Solver(ABC):
         """Return why it does not support ``medium`` in its scene; None if it does."""
 
     @classmethod
+    def weakness(cls, scene: mi.Scene, medium: MediumGrid, max_depth: int) -> str | None:
+        """Return why it supports ``medium`` in its scene but is inaccurate; None if it is not.
+
+        ``auto`` tries other solvers then.
+        """
+        return None
+
+    @classmethod
     @abstractmethod
     def why(cls, medium: MediumGrid) -> str:
         """Return why ``auto`` chooses it for ``medium`` if it is the first candidate."""

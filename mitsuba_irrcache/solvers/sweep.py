@@ -12,6 +12,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, occupied_box
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, illuminating, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.glossy_reflections import narrow_beam
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
@@ -114,6 +115,12 @@ class SweepSolver(Solver):
         found = obstacle(scene, grid, *box)
         what = "is emissive" if medium.phase.is_isotropic else "scatters anisotropically"
         return found and f"{found} reaches into {name}, which {what}"
+
+    @classmethod
+    def weakness(cls, scene: mi.Scene, medium: MediumGrid, max_depth: int) -> str | None:
+        if medium.is_isolated or 0 <= max_depth <= 2:
+            return None
+        return narrow_beam(scene, medium)
 
     @classmethod
     def why(cls, medium: MediumGrid) -> str:
