@@ -30,7 +30,7 @@ DISTANCE_RAYS, GATHERED, GATHERED_INDIRECT = 32, 128, 32
 #: cosine of the angle between them for a source without extent.
 AROUND_SOURCES, MEAN_COSINE = 32, 0.85
 #: Nodes of a view up to which all rays are used: more nodes are close to each other, so that their
-#: errors average out within a pixel, as do those of the dense nodes in shadows of forward peaks.
+#: errors average out within a pixel.
 FINE_NODES = 1 << 15
 #: Number of nodes from which on no further ones are created.
 MOST_NODES = 1 << 18
@@ -110,8 +110,7 @@ class SurfaceIrradiance:
             if not found:
                 break
             place, active = (_joined(parts) for parts in zip(*found, strict=True))
-        is_sparse = seen - first <= FINE_NODES and not self.paths.narrow_sources
-        rays = GATHERED if is_sparse else GATHERED_INDIRECT
+        rays = GATHERED if seen - first <= FINE_NODES else GATHERED_INDIRECT
         groups = (first, seen, rays), (seen, self.nodes.count, GATHERED_INDIRECT)
         self._groups += [group for group in groups if group[0] < group[1]]
 
