@@ -36,15 +36,15 @@ class Start:
         adjoint: derivative of the objective with respect to the radiance along the rays.
         alpha: derivative with respect to what the rays see if they leave the scene: -1 times that
             with respect to alpha; None without.
-        irradiance: derivative with respect to the irradiance of emitters at the origin of the rays,
-            which isotropic scattering there adds; None for rays of a camera.
+        adjoint_of_irradiance: derivative with respect to the irradiance of emitters at the origin
+            of the rays, which isotropic scattering there adds; None for rays of a camera.
         rng: random number generator.
     """
 
     ray: mi.Ray3f
     adjoint: mi.Spectrum
     alpha: mi.Float | None
-    irradiance: mi.Spectrum | None
+    adjoint_of_irradiance: mi.Spectrum | None
     rng: mi.PCG32
 
 
@@ -101,7 +101,8 @@ class _Vertex:
     Attributes:
         shadow: ray to the sampled point of an emitter; ``length`` is its length.
         direct: weighted radiance of the emitter that the vertex scatters along the path.
-        record, emitter: the sampled direction, and the weight of the emitter's radiance.
+        record, emitter_weight: the sampled direction, and the weight of the radiance of the
+            emitter.
         surface: the surface; None for a voxel.
         next_direction, scattering: the direction of the next segment, and the BSDF there.
         active: paths that have this vertex.
@@ -111,7 +112,7 @@ class _Vertex:
     length: mi.Float
     direct: mi.Spectrum
     record: mi.DirectionSample3f
-    emitter: mi.Spectrum
+    emitter_weight: mi.Spectrum
     origin: mi.Interaction3f
     surface: mi.SurfaceInteraction3f | None
     towards: mi.Vector3f
@@ -201,14 +202,14 @@ class PathAdjoint:
         ray, weight, rng = start.ray, mi.Spectrum(start.adjoint), start.rng
         active, origin, total = mi.Bool(True), dr.zeros(mi.Interaction3f), mi.Spectrum(0)
         density, vertex = mi.Float(0), None
-        if start.irradiance is not None:
+        if start.adjoint_of_irradiance is not None:
             origin = dr.zeros(mi.Interaction3f, dr.width(ray.d))
             origin.p, density = ray.o, mi.Float(UNIFORM)
-            vertex, rng = self._start_in_voxel(origin, start.irradiance, rng)
+            vertex, rng = self._start_in_voxel(origin, start.adjoint_of_irradiance, rng)
             total += vertex.direct
         self._vertices.append(vertex)
         for number in range(MOST_SURFACES):
-            is_first = number == 0 and start.irradiance is None
+            is_first = number == 0 and start.adjoint_of_irradiance is None
             offset = 1 - rng.next_float32()
             arrival = origin, density, is_first
             alpha = start.alpha if is_first else None
@@ -239,7 +240,7 @@ class PathAdjoint:
             shadow, record.dist, scale * emitter, record, scale, origin, None, record.d,
             mi.Spectrum(1), mi.Bool(True),
         )  # fmt: skip
-        dr.eval(vertex.direct, vertex.emitter, vertex.shadow, rng)
+        dr.eval(vertex.direct, vertex.emitter_weight, vertex.shadow, rng)
         return vertex, rng
 
     def _emitter(
@@ -333,7 +334,7 @@ class PathAdjoint:
         active = active & goes_on
         weight = dr.select(active, weight / chance, 0)
         ray = mi.Ray3f(si.spawn_ray(si.to_world(found.wo)))
-        dr.eval(vertex.direct, vertex.emitter, vertex.shadow, vertex.scattering)
+        dr.eval(vertex.direct, vertex.emitter_weight, vertex.shadow, vertex.scattering)
         return vertex, ray, weight, (origin, density), active, rng
 
     def largest(self) -> float:
@@ -407,7 +408,7 @@ class PathAdjoint:
                 value = self._scene.eval_emitter_direction(vertex.origin, record, lit)
                 pull(
                     value / dr.select(record.pdf > 0, record.pdf, 1),
-                    dr.select(lit, vertex.emitter, 0),
+                    dr.select(lit, vertex.emitter_weight, 0),
                 )
         if self._surfaces and vertex.surface is not None:
             self._add_surface(vertex, rest, lit)

@@ -20,8 +20,8 @@ class EmitterKind(Enum):
 
     To add a kind, extend this class and `kind_of`. The solver ``sweep`` rejects it until
     ``solvers/sweep.EMITTERS`` and `DistantIllumination` support it, `half_space` is not used with
-    it until it is in ``half_space.EMITTERS``, and gradients are refused until it is in
-    ``gradients/backward.EMITTERS``. The solver ``path`` samples all kinds through
+    it until it is in ``half_space.EMITTERS``, and gradients of scenes without surfaces are refused
+    until it is in ``gradients/backward.EMITTERS``. The solver ``path`` samples all kinds through
     Mitsuba's interface; for anisotropic scattering, narrow kinds have to be added to `sources_of`.
     """
 
