@@ -202,6 +202,8 @@ class PathAdjoint:
         ray, weight, rng = start.ray, mi.Spectrum(start.adjoint), start.rng
         active, origin, total = mi.Bool(True), dr.zeros(mi.Interaction3f), mi.Spectrum(0)
         density, vertex = mi.Float(0), None
+        # whether the camera sees what the path hits, straight or through null interfaces
+        is_seen = mi.Bool(start.adjoint_of_irradiance is None)
         if start.adjoint_of_irradiance is not None:
             origin = dr.zeros(mi.Interaction3f, dr.width(ray.d))
             origin.p, density = ray.o, mi.Float(UNIFORM)
@@ -209,21 +211,19 @@ class PathAdjoint:
             total += vertex.direct
         self._vertices.append(vertex)
         for number in range(MOST_SURFACES):
-            is_first = number == 0 and start.adjoint_of_irradiance is None
             offset = 1 - rng.next_float32()
-            arrival = origin, density, is_first
-            alpha = start.alpha if is_first else None
+            arrival = origin, density, is_seen
+            alpha = start.alpha if number == 0 else None
             segment = self._segment(ray, weight, arrival, offset, active, alpha)
             self._segments.append(segment)
             total += segment.gathered() + segment.emitted + segment.escaped
             active = active & segment.end.is_valid()
-            arrival = origin, density
-            vertex, ray, weight, (origin, density), active, rng = self._scatter(
+            vertex, ray, weight, (origin, density, is_seen), active, rng = self._scatter(
                 segment, number, arrival, active, rng
             )
             self._vertices.append(vertex)
             total += vertex.direct
-            dr.eval(total, ray, weight, origin, density, active, rng)
+            dr.eval(total, ray, weight, origin, density, is_seen, active, rng)
             if not dr.any(active):
                 break
         return total
@@ -266,19 +266,17 @@ class PathAdjoint:
         active: mi.Bool,
         alpha: mi.Float | None,
     ) -> _Segment:
-        origin, density, is_first = arrival
-        end, distance = next_solid(self._scene, ray, active, is_first and self._hides)
+        origin, density, is_seen = arrival
+        hides = is_seen if self._hides else mi.Bool(False)
+        end, distance = next_solid(self._scene, ray, active, hides)
         spans = self._media.spans(ray, distance, active)
         dr.eval(end, distance, spans)
         scattered, before, through = self._media.march(ray, spans, offset)
         emitter = end.emitter(self._scene, active)
-        share = mi.Float(1)
-        if not is_first:
-            record = mi.DirectionSample3f(self._scene, end, origin)
-            other = self._scene.pdf_emitter_direction(origin, record, active)
-            share = dr.select(density > 0, power_heuristic(density, other), 1)
-        elif self._hides:
-            share = mi.Float(0)
+        record = mi.DirectionSample3f(self._scene, end, origin)
+        other = self._scene.pdf_emitter_direction(origin, record, active & ~is_seen)
+        share = dr.select(density > 0, power_heuristic(density, other), 1)
+        share = dr.select(hides, 0, share)
         emitter_weight = dr.select(active, weight * through * share, 0)
         emitted = emitter_weight * emitter.eval(end, active)
         escaped = mi.Spectrum(0)
@@ -296,8 +294,9 @@ class PathAdjoint:
     ) -> tuple[_Vertex, mi.Ray3f, mi.Spectrum, tuple, mi.Bool, mi.PCG32]:
         """Scatter paths at the end of a segment.
 
-        ``arrival`` is the position where the path last chose a direction, and its density. Returns
-        the vertex, and ray, weight and ``arrival`` of the next segment.
+        ``arrival`` is the position where the path last chose a direction, its density, and whether
+        the camera sees what it hits. Returns the vertex, and ray, weight and ``arrival`` of the
+        next segment.
         """
         si, bsdf = segment.end, segment.end.bsdf()
         arriving = segment.weight * segment.through
@@ -319,6 +318,7 @@ class PathAdjoint:
         density = dr.select(mi.has_flag(found.sampled_type, mi.BSDFFlags.Delta), 0, found.pdf)
         density = dr.select(is_straight, arrival[1], density)
         origin = dr.select(is_straight, arrival[0], mi.Interaction3f(si))
+        is_seen = is_straight & arrival[2]
         active = active & (dr.max(dr.abs(weight)) > 0)
         chance = mi.Float(1)
         if number >= ROULETTE_AFTER:
@@ -335,7 +335,7 @@ class PathAdjoint:
         weight = dr.select(active, weight / chance, 0)
         ray = mi.Ray3f(si.spawn_ray(si.to_world(found.wo)))
         dr.eval(vertex.direct, vertex.emitter_weight, vertex.shadow, vertex.scattering)
-        return vertex, ray, weight, (origin, density), active, rng
+        return vertex, ray, weight, (origin, density, is_seen), active, rng
 
     def largest(self) -> float:
         """Return an upper bound of the weighted radiance that any part of a path has ahead."""
@@ -435,9 +435,9 @@ def power_heuristic_or_one(record: mi.DirectionSample3f, other: mi.Float) -> mi.
 
 
 @symbolic
-def next_solid(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, hides_emitters: bool = False):
+def next_solid(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, hides_emitters: mi.Bool):
     """Return the first surface along rays that is more than the boundary of a medium, and the
-    distance to it (infinite if there is none). Rays pass emitters if these are hidden.
+    distance to it (infinite if there is none). Rays pass emitters where these are hidden.
     """
     si, ahead, active = dr.zeros(mi.SurfaceInteraction3f), mi.Ray3f(ray), mi.Bool(active)
     found, crossings = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d)), mi.UInt32(0)
@@ -446,8 +446,7 @@ def next_solid(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, hides_emitters: 
     while dr.hint(active, label="next surface"):
         si = scene.ray_intersect(ahead, active)
         solid = active & si.is_valid() & is_solid(si)
-        if dr.hint(hides_emitters, mode="scalar"):
-            solid &= si.shape.emitter() == None  # noqa: E711
+        solid &= ~(hides_emitters & (si.shape.emitter() != None))  # noqa: E711
         found = dr.select(solid, si, found)
         ahead = si.spawn_ray(ahead.d)
         crossings += 1

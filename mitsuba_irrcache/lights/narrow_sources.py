@@ -106,11 +106,6 @@ class Source:
         return self.far == other.far and np.array_equal(self._direction, other._direction)
 
     @property
-    def solid_angle(self) -> float:
-        """Solid angle [sr] of a source that is ``far``."""
-        return float(2 * np.pi * (1 - self._cosine))
-
-    @property
     def is_spot(self) -> bool:
         """Whether it is a bright spot of an environment, which has an extent."""
         return self.far and self._cosine < np.cos(MIN_ANGULAR_RADIUS) - 1e-6

@@ -1,4 +1,4 @@
-"""Flat glossy surfaces that reflect a sun into a medium, by a narrow beam.
+"""Glossy surfaces that reflect a small source into a medium, by a beam of nearly one direction.
 
 The ordinates of the solver ``sweep`` are the same for all voxels: a beam that is narrower than the
 angles between them is missed by all voxels, or counts several times in all.
@@ -6,113 +6,139 @@ angles between them is missed by all voxels, or counts several times in all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.lights.emitters import EmitterKind, illuminating, kind_of
 from mitsuba_irrcache.lights.narrow_sources import Source, sources_of
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.consistency import described
-from mitsuba_irrcache.transport.path import flags_of, is_surface
+from mitsuba_irrcache.transport.path import flags_of, is_null, transmits
 
 #: Solid angle [sr] of reflected beams below which ordinates do not resolve them. Fog over a floor
 #: of roughness 0.05, 0.1 and 0.2 under a sun has errors of 25, 2 and 0.4 % with 64 directions.
 NARROW = 0.2
-#: Least reflectance of a lobe that matters.
+#: Least reflectance of a lobe that matters, at the angle of incidence of the source.
 LEAST_REFLECTANCE = 0.1
-#: Number of points that are sampled on a surface, and of samples of a BSDF; largest angle [rad]
-#: between normals of a flat part, and least share of the points in it.
-POINTS, SAMPLES, FLAT, FLAT_SHARE = 256, 1024, 0.02, 0.1
-#: Cosine of the angle of incidence at which BSDFs are sampled.
-COSINE = 0.7
+#: Number of rays from the medium that look for surfaces, and of samples of the BSDF of each.
+RAYS, SAMPLES = 4096, 16
+#: Number of null surfaces that these rays cross, at most.
+CROSSINGS = 16
+#: Angle [rad] within which reflected beams have the same direction; least number of hits and least
+#: share of the hits with beams into the medium for which it is the same.
+SAME, FEWEST, LEAST_SHARE = 0.1, 8, 0.25
 
 _REFLECTION = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.GlossyReflection)
 
 
 def narrow_beam(scene: mi.Scene, medium: MediumGrid) -> str | None:
-    """Return a description of a surface that reflects a sun, or a bright spot of an environment,
-    into ``medium`` by a beam narrower than `NARROW`; None without any.
+    """Return a description of a source that surfaces reflect into ``medium`` by a beam narrower
+    than `NARROW`; None without any.
     """
-    far = any(
-        kind_of(e).is_environment or kind_of(e) is EmitterKind.SUN for e in illuminating(scene)
-    )
-    glossy = [s for s in scene.shapes() if is_surface(s) and flags_of(s) & _REFLECTION]
-    if not far or not glossy:
+    # The BSDFs of instances are those of their groups.
+    if not any(flags_of(s) & _REFLECTION or s.class_name() == "Instance" for s in scene.shapes()):
         return None
-    suns = [source for source in sources_of(scene)[0] if source.far]
-    for shape in glossy if suns else ():
-        lobe = _lobe(shape.bsdf())
-        if lobe is None:
-            continue
-        for points, normal in _flat_parts(shape):
-            for sun in suns:
-                # A mirror reflects only sources that have an extent.
-                width = lobe + (sun.solid_angle if sun.is_spot else 0.0)
-                if 0 < width < NARROW and _meets(points, normal, sun, medium):
-                    return (
-                        f"{described(shape)} reflects a sun into a beam of {width:.2g} sr, "
-                        "narrower than the angles between directions"
-                    )
+    sources, _ = sources_of(scene)
+    if not sources:
+        return None
+    centre, radius = _bounding_sphere(medium)
+    si = _surfaces_around(scene, medium)
+    # What glass around a medium reflects inside does not come straight from a source.
+    reflects = si.is_valid() & ~(si.is_medium_transition() & transmits(si.bsdf().flags()))
+    for source in sources:
+        towards, cosine = source.seen_from(si.p)
+        n = dr.select(dr.dot(si.n, si.to_world(si.wi)) < 0, -si.n, si.n)
+        facing = reflects & (dr.dot(n, towards) > 0) & (cosine <= 1)
+        beam = 2 * dr.dot(towards, n) * n - towards
+        solid_angle, reflectance, is_delta = _lobe(si, towards, facing)
+        extent = np.array(dr.two_pi * (1 - dr.minimum(cosine, 1)), dtype=np.float64)
+        # A mirror reflects only sources that have an extent.
+        width = np.where(is_delta, extent if _has_extent(source) else 0, solid_angle + extent)
+        meets = np.array(facing & _meets(si.p, beam, centre, radius))
+        meets &= reflectance > LEAST_REFLECTANCE
+        narrow = meets & (width > 0) & (width < NARROW)
+        if narrow.any() and _have_one_direction(np.array(beam, dtype=np.float64).T[narrow]):
+            return (
+                f"a surface reflects {_described(source)} into the medium by a beam of "
+                f"{np.median(width[narrow]):.2g} sr, narrower than the angles between directions"
+            )
     return None
 
 
-def _lobe(bsdf: mi.BSDF) -> float | None:
-    """Return the solid angle [sr] of the reflection of a BSDF without diffuse lobes, 0 for mirrors;
-    None if it reflects little.
-    """
-    rng = np.random.default_rng(SAMPLES)
-    u = np.float32(rng.random((5, SAMPLES)))
-    si = dr.zeros(mi.SurfaceInteraction3f, SAMPLES)
-    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
-    si.n, si.uv = mi.Normal3f(0, 0, 1), mi.Point2f(u[:2])
-    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    si.wi = mi.Vector3f(float(np.sqrt(1 - COSINE**2)), 0, COSINE)
-    context = mi.BSDFContext()
-    context.type_mask = _REFLECTION
-    found, weight = bsdf.sample(context, si, mi.Float(u[2]), mi.Point2f(u[3:]), True)
-    reflected = (found.wo.z > 0) & mi.has_flag(found.sampled_type, mi.BSDFFlags.Reflection)
-    weight = np.array(dr.select(reflected, dr.max(weight), 0), dtype=np.float64)
-    is_delta = np.array(mi.has_flag(found.sampled_type, mi.BSDFFlags.Delta))
-    density = np.where(is_delta, np.inf, np.array(found.pdf, dtype=np.float64))
-    weight, density = (np.broadcast_to(x, SAMPLES) for x in (weight, density))
-    if not weight.mean() > LEAST_REFLECTANCE:
-        return None
-    # The mean density of samples of a uniform lobe is the reciprocal of its solid angle.
-    own = weight > 0
-    return float(1 / np.median(density[own]))
-
-
-def _flat_parts(shape: mi.Shape) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield points (n, 3) of the flat parts of a shape, and the normal (3) of each part."""
-    sample = mi.Point2f(np.float32(np.random.default_rng(POINTS).random((2, POINTS))))
-    try:
-        found = shape.sample_position(0.0, sample)
-    except RuntimeError:
-        return  # shapes without sampling, such as instances
-    points, normals = (np.array(x, dtype=np.float64).T for x in (found.p, found.n))
-    left = np.isfinite(points).all(axis=1)
-    while left.any():
-        normal = normals[np.argmax(left)]
-        own = left & (normals @ normal > np.cos(FLAT))
-        own |= left & (np.arange(len(left)) == np.argmax(left))
-        left &= ~own
-        if own.sum() >= FLAT_SHARE * POINTS:
-            yield points[own], normal
-
-
-def _meets(points: np.ndarray, normal: np.ndarray, sun: Source, medium: MediumGrid) -> bool:
-    """Return whether rays towards ``medium``, reflected at ``points``, come from a ``sun``."""
-    towards = np.array(sun.place, dtype=np.float64).reshape(-1)
-    reflected = 2 * (towards @ normal) * normal - towards
-    frame = medium.frame
+def _bounding_sphere(medium: MediumGrid) -> tuple[np.ndarray, float]:
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
-    corners = (frame[:3, :3] @ corners + frame[:3, 3:]).T
+    corners = (medium.frame[:3, :3] @ corners + medium.frame[:3, 3:]).T
     centre = corners.mean(axis=0)
-    radius = np.linalg.norm(corners - centre, axis=1).max()
-    offset = centre - points
-    along = offset @ reflected
-    distance = np.sqrt(np.maximum((offset**2).sum(axis=1) - along**2, 0))
-    return bool(((distance < radius) & (along > 0)).any())
+    return centre, float(np.linalg.norm(corners - centre, axis=1).max())
+
+
+def _surfaces_around(scene: mi.Scene, medium: MediumGrid) -> mi.SurfaceInteraction3f:
+    """Return the first surfaces that are not null along random rays from ``medium``."""
+    rng = np.random.default_rng(RAYS)
+    u = rng.random((3, RAYS))
+    p = medium.frame[:3, :3] @ u + medium.frame[:3, 3:]
+    d = rng.normal(size=(3, RAYS))
+    d /= np.linalg.norm(d, axis=0)
+    ray = mi.Ray3f(mi.Point3f(np.float32(p)), mi.Vector3f(np.float32(d)))
+    found, active = dr.zeros(mi.SurfaceInteraction3f, RAYS), mi.Bool(True)
+    for _ in range(CROSSINGS):
+        si = scene.ray_intersect(ray, active)
+        ends = active & si.is_valid() & ~is_null(si.bsdf().flags())
+        found = dr.select(ends, si, found)
+        active &= si.is_valid() & ~ends
+        ray = si.spawn_ray(ray.d)
+        dr.eval(found, active, ray)
+        if not dr.any(active)[0]:
+            break
+    return found
+
+
+def _lobe(
+    si: mi.SurfaceInteraction3f, towards: mi.Vector3f, active: mi.Bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return, for each surface, the solid angle [sr] of its reflection of radiance from the
+    direction ``towards``, its reflectance without diffuse lobes, and whether it is a mirror.
+    """
+    index = dr.arange(mi.UInt32, RAYS * SAMPLES) // SAMPLES
+    si = dr.gather(mi.SurfaceInteraction3f, si, index)
+    si.wi = si.to_local(dr.gather(mi.Vector3f, towards, index))
+    active = dr.gather(mi.Bool, active, index)
+    rng = mi.PCG32(RAYS * SAMPLES)
+    sample = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    found, weight = si.bsdf().sample(mi.BSDFContext(), si, *sample, active)
+    reflects = active & mi.has_flag(found.sampled_type, mi.BSDFFlags.Reflection)
+    reflects &= ~mi.has_flag(found.sampled_type, mi.BSDFFlags.DiffuseReflection)
+    reflects &= found.wo.z * si.wi.z > 0
+    weight = np.array(dr.select(reflects, dr.max(weight), 0), dtype=np.float64)
+    delta = np.array(reflects & mi.has_flag(found.sampled_type, mi.BSDFFlags.Delta))
+    density = np.array(dr.select(reflects, found.pdf, 0), dtype=np.float64)
+    weight, delta, density = (x.reshape(RAYS, SAMPLES) for x in (weight, delta, density))
+    glossy = (density > 0) & ~delta
+    count = np.maximum(glossy.sum(axis=1), 1)
+    mean = np.where(glossy, density, 0).sum(axis=1) / count
+    solid_angle = np.where(mean > 0, 1 / np.where(mean > 0, mean, 1), np.inf)
+    return solid_angle, weight.mean(axis=1), delta.any(axis=1) & ~glossy.any(axis=1)
+
+
+def _has_extent(source: Source) -> bool:
+    """Return whether paths can hit a source by chance."""
+    return source.is_spot if source.far else not source.sharp
+
+
+def _described(source: Source) -> str:
+    if source.far:
+        return "a sun or a bright spot of an environment"
+    return "a point" if source.sharp else "a small lamp"
+
+
+def _meets(p: mi.Point3f, d: mi.Vector3f, centre: np.ndarray, radius: float) -> mi.Bool:
+    """Return whether rays meet a sphere."""
+    offset = mi.Point3f(*centre.tolist()) - p
+    along = dr.dot(offset, d)
+    return (along > 0) & (dr.squared_norm(offset) - dr.square(along) < radius**2)
+
+
+def _have_one_direction(beams: np.ndarray) -> bool:
+    """Return whether a considerable share of ``beams`` (n, 3) has the same direction."""
+    centres = beams[:: max(len(beams) // 64, 1)]
+    same = ((beams @ centres.T) > np.cos(SAME)).sum(axis=0)
+    return bool(same.max() >= max(FEWEST, LEAST_SHARE * len(beams)))

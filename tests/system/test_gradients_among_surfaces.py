@@ -64,6 +64,25 @@ def test_hidden_lamps_do_not_hide_the_medium(mono):
     assert hidden == pytest.approx(alone, rel=0.05)
 
 
+@pytest.mark.parametrize("opacity", [None, 0.4], ids=["thindielectric", "mask"])
+def test_emitters_stay_hidden_behind_panes(mono, opacity):
+    """Images depend linearly on the sky's radiance, and do not show a hidden sky behind a pane, but
+    gradients counted it: they were 8 to 20 times too large.
+    """
+    camera = np.array([1.0, 1.5, -5.0])
+    place = mi.ScalarTransform4f().look_at(0.5 * camera, camera, [0, 1, 0]).scale(2)
+    bsdf = {"type": "thindielectric"}
+    if opacity:
+        bsdf = {"type": "mask", "opacity": opacity, "nested": {"type": "diffuse"}}
+    pane = {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+    scene = Case(objects=lambda: {"pane": pane}).load(hide_emitters=True)
+    weights = pixel_weights(scene)
+    found = gradients(scene, ("sky",), weights)["sky"]
+    image = np.array(mi.render(scene, spp=256, seed=3), dtype=np.float64)
+    value = float(np.array(mi.traverse(scene)["sky.radiance.value"]).ravel()[0])
+    assert found.sum() * value == pytest.approx((image * weights).sum(), rel=0.03)
+
+
 def test_gradients_in_colour_are_those_of_the_image(rgb):
     """By the reflectance of the ground, and by the irradiance of the sun."""
     case = SURROUNDED["ground, sky and sun, in colour"]

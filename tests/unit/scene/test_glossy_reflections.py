@@ -48,7 +48,43 @@ def sky_with_a_sun() -> dict:
     return {"type": "envmap", "bitmap": mi.Bitmap(texels)}
 
 
+def water() -> dict:
+    return floor({"type": "roughdielectric", "alpha": 0.03, "int_ior": 1.33})
+
+
+def plastic() -> dict:
+    return floor({"type": "roughplastic", "alpha": 0.05})
+
+
+def masked() -> dict:
+    return floor({"type": "mask", "opacity": 0.8, "nested": metal(0.02)})
+
+
+def vast() -> dict:
+    """A floor of which almost no point reflects into the medium."""
+    return floor(metal(0.05)) | {"to_world": floor(metal(0.05))["to_world"].scale(300)}
+
+
+def planet() -> dict:
+    return {"type": "sphere", "center": [0, -1001.4, 0], "radius": 1000, "bsdf": metal(0.05)}
+
+
+LOW_SUN = {"type": "directional", "direction": [0.78, -0.2, 0.6]}
+FAR_POINT = {"type": "point", "position": [4, 30, 6], "intensity": 1000.0}
+NEAR_POINT = {"type": "point", "position": [0.5, 2.0, 0], "intensity": 10.0}
+EMITTER = {"type": "area", "radiance": 8000.0}
+FAR_LAMP = {"type": "sphere", "center": [4, 30, 6], "radius": 0.3, "emitter": EMITTER}
+
 CASES = {
+    "rough water, low sun": (water, lambda: LOW_SUN, "path"),
+    "rough water, high sun": (water, lambda: SUN, "sweep"),
+    "rough plastic, low sun": (plastic, lambda: LOW_SUN, "path"),
+    "mask": (masked, lambda: SUN, "path"),
+    "vast floor": (vast, lambda: SUN, "path"),
+    "nearly flat ball": (planet, lambda: SUN, "path"),
+    "far point": (lambda: floor(metal(0.05)), lambda: FAR_POINT, "path"),
+    "near point": (lambda: floor(metal(0.05)), lambda: NEAR_POINT, "sweep"),
+    "far lamp": (lambda: floor(metal(0.05)), lambda: FAR_LAMP, "path"),
     "rough 0.05": (lambda: floor(metal(0.05)), lambda: SUN, "path"),
     "rough 0.1": (lambda: floor(metal(0.1)), lambda: SUN, "path"),
     "rough 0.2": (lambda: floor(metal(0.2)), lambda: SUN, "sweep"),
@@ -71,12 +107,24 @@ def test_the_choice_of_solver(scenes, logged, name):
     (medium,) = compile_scene(scene).visible
     chosen, reason = choose_solver(scene, medium, "auto")
     assert chosen.name == solver
-    assert ("reflects a sun" in reason) == (solver == "path")
+    assert ("into the medium by a beam" in reason) == (solver == "path")
     choose_solver(scene, medium, "sweep")
     assert any("depends on cache_seed" in text for text in logged) == (solver == "path")
     logged.clear()
     choose_solver(scene, medium, "sweep", max_depth=2)
     assert not any("depends on cache_seed" in text for text in logged)
+
+
+def test_instances(scenes):
+    """Their BSDFs are those of their group."""
+    objects = {
+        "emitter": SUN,
+        "group": {"type": "shapegroup", "floor": floor(metal(0.05))},
+        "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+    }
+    scene = scenes.load({"type": "volpath"}, scenes.boundary(scenes.medium(0.6, 0.9)), **objects)
+    (medium,) = compile_scene(scene).visible
+    assert choose_solver(scene, medium, "auto")[0].name == "path"
 
 
 def test_forward_peaks_are_warned_of(scenes, logged):
