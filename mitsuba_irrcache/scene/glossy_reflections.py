@@ -43,20 +43,24 @@ def narrow_beam(scene: mi.Scene, medium: MediumGrid) -> str | None:
     centre, radius = _bounding_sphere(medium)
     si = _surfaces_around(scene, medium)
     # What glass around a medium reflects inside does not come straight from a source.
-    reflects = si.is_valid() & ~(si.is_medium_transition() & transmits(si.bsdf().flags()))
+    flags = si.bsdf().flags()
+    reflects = si.is_valid() & ~(si.is_medium_transition() & transmits(flags))
+    reflects &= (flags & _REFLECTION) != 0
     for source in sources:
         towards, cosine = source.seen_from(si.p)
         n = dr.select(dr.dot(si.n, si.to_world(si.wi)) < 0, -si.n, si.n)
         facing = reflects & (dr.dot(n, towards) > 0) & (cosine <= 1)
         beam = 2 * dr.dot(towards, n) * n - towards
+        facing &= _meets(si.p, beam, centre, radius)
+        beams, meets = np.array(beam, dtype=np.float64).T, np.array(facing)
+        if not _have_one_direction(beams[meets], 0.0):
+            continue
         solid_angle, reflectance, is_delta = _lobe(si, towards, facing)
         extent = np.array(dr.two_pi * (1 - dr.minimum(cosine, 1)), dtype=np.float64)
         # A mirror reflects only sources that have an extent.
         width = np.where(is_delta, extent if _has_extent(source) else 0, solid_angle + extent)
-        meets = np.array(facing & _meets(si.p, beam, centre, radius))
-        meets &= reflectance > LEAST_REFLECTANCE
-        narrow = meets & (width > 0) & (width < NARROW)
-        if narrow.any() and _have_one_direction(np.array(beam, dtype=np.float64).T[narrow]):
+        narrow = meets & (reflectance > LEAST_REFLECTANCE) & (width > 0) & (width < NARROW)
+        if _have_one_direction(beams[narrow], LEAST_SHARE):
             return (
                 f"a surface reflects {_described(source)} into the medium by a beam of "
                 f"{np.median(width[narrow]):.2g} sr, narrower than the angles between directions"
@@ -137,8 +141,10 @@ def _meets(p: mi.Point3f, d: mi.Vector3f, centre: np.ndarray, radius: float) -> 
     return (along > 0) & (dr.squared_norm(offset) - dr.square(along) < radius**2)
 
 
-def _have_one_direction(beams: np.ndarray) -> bool:
-    """Return whether a considerable share of ``beams`` (n, 3) has the same direction."""
+def _have_one_direction(beams: np.ndarray, least_share: float) -> bool:
+    """Return whether at least `FEWEST` and this share of ``beams`` (n, 3) have one direction."""
+    if len(beams) < FEWEST:
+        return False
     centres = beams[:: max(len(beams) // 64, 1)]
     same = ((beams @ centres.T) > np.cos(SAME)).sum(axis=0)
-    return bool(same.max() >= max(FEWEST, LEAST_SHARE * len(beams)))
+    return bool(same.max() >= max(FEWEST, least_share * len(beams)))
