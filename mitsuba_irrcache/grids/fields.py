@@ -112,9 +112,9 @@ def positions_between_voxels(field: Field, count: int) -> mi.Point3f | None:
     chosen = dr.compress(differs)
     if not dr.width(chosen):
         return None
-    rng = mi.PCG32(count)
-    place = mi.UInt32(rng.next_float32() * dr.opaque(mi.Float, float(dr.width(chosen))))
-    index = dr.gather(mi.UInt32, chosen, dr.minimum(place, dr.width(chosen) - 1))
+    rng, last = mi.PCG32(count), dr.opaque(mi.UInt32, dr.width(chosen) - 1)
+    place = mi.UInt32(rng.next_float32() * (mi.Float(last) + 1))
+    index = dr.gather(mi.UInt32, chosen, dr.minimum(place, last))
     u = mi.Point3f(*grid.voxel_indices(index)) + 0.5
     u += mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
     size = mi.Point3f(*(mi.Float(n) for n in grid.sides))
