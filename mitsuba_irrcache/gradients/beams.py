@@ -13,6 +13,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import SPOT_LIKE, position_of
 from mitsuba_irrcache.lights.falloff import lies_in
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
+from mitsuba_irrcache.scene.occluders import bounding_sphere
 
 #: Least width of a beam at the centre of the medium, in voxels of the cache. At three voxels the
 #: derivative with respect to the intensity of a spot is 15 % too small, at six within 2 %.
@@ -41,10 +42,8 @@ def _width_at(light: mi.Emitter, grid: Grid) -> float:
     """Return the least width of the beam of ``light`` at the distance of the centre of ``grid``;
     infinite if the beam misses the sphere around the grid.
     """
-    corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
-    corners = (grid.to_world[:3, :3] @ corners + grid.to_world[:3, 3:]).T
-    centre = corners.mean(axis=0)
-    radius, offset = np.linalg.norm(corners - centre, axis=1).max(), centre - position_of(light)
+    centre, radius = bounding_sphere(grid.to_world)
+    offset = centre - position_of(light)
     distance = np.linalg.norm(offset)
 
     rng = np.random.default_rng(RAYS)

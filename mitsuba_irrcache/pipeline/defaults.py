@@ -61,24 +61,20 @@ def choose_solver(
     reasons, inaccurate = [], []
     for candidate in candidates:
         reason = candidate.why_not(scene, medium, max_depth, resolution)
-        if (
-            reason is None
-            and inaccurate
-            and medium.phase.forward
-            and not candidate.supports_delta_m
-        ):
-            continue
-        weakness = candidate.weakness(scene, medium, max_depth) if reason is None else None
-        if reason is None and weakness is None:
-            chosen = candidate
-            break
-        if weakness is not None:
-            inaccurate.append((candidate, weakness))
-        reasons.append(reason or weakness)
+        if reason is None:
+            refuses_peak = medium.phase.forward and not candidate.supports_delta_m
+            if inaccurate and refuses_peak:
+                continue
+            reason = candidate.weakness(scene, medium, max_depth)
+            if reason is None:
+                chosen = candidate
+                break
+            inaccurate.append((candidate, reason))
+        reasons.append(reason)
     else:
         chosen = None
     if chosen is None and inaccurate:
-        chosen, weakness = inaccurate[0]
+        (chosen, weakness), *_ = inaccurate
         _warn_of_weakness(medium, chosen, weakness)
         reasons = []
     if chosen is None:

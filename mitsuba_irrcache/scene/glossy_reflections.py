@@ -12,6 +12,7 @@ import numpy as np
 
 from mitsuba_irrcache.lights.narrow_sources import Source, sources_of
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.occluders import bounding_sphere
 from mitsuba_irrcache.transport.path import flags_of, is_null, transmits
 
 #: Solid angle [sr] of reflected beams below which ordinates do not resolve them. Fog over a floor
@@ -40,7 +41,7 @@ def narrow_beam(scene: mi.Scene, medium: MediumGrid) -> str | None:
     sources, _ = sources_of(scene)
     if not sources:
         return None
-    centre, radius = _bounding_sphere(medium)
+    centre, radius = bounding_sphere(medium.frame)
     si = _surfaces_around(scene, medium)
     # What glass around a medium reflects inside does not come straight from a source.
     flags = si.bsdf().flags()
@@ -66,13 +67,6 @@ def narrow_beam(scene: mi.Scene, medium: MediumGrid) -> str | None:
                 f"{np.median(width[narrow]):.2g} sr, narrower than the angles between directions"
             )
     return None
-
-
-def _bounding_sphere(medium: MediumGrid) -> tuple[np.ndarray, float]:
-    corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
-    corners = (medium.frame[:3, :3] @ corners + medium.frame[:3, 3:]).T
-    centre = corners.mean(axis=0)
-    return centre, float(np.linalg.norm(corners - centre, axis=1).max())
 
 
 def _surfaces_around(scene: mi.Scene, medium: MediumGrid) -> mi.SurfaceInteraction3f:

@@ -74,6 +74,13 @@ def corners_of(frame: np.ndarray) -> np.ndarray:
     return _mapped(frame, _PICK)
 
 
+def bounding_sphere(frame: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return centre (3) and radius of the sphere around the unit cube mapped by ``frame``."""
+    corners = corners_of(frame)
+    centre = corners.mean(axis=0)
+    return centre, float(np.linalg.norm(corners - centre, axis=1).max())
+
+
 def _mapped(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Apply an affine map to points (n, 3)."""
     return (matrix[:3, :3] * points[:, None, :]).sum(axis=-1) + matrix[:3, 3]
