@@ -11,7 +11,7 @@ from mitsuba_irrcache.gradients.emitters import solid_angles
 from mitsuba_irrcache.gradients.lights import LightsOfOneDirection
 from mitsuba_irrcache.gradients.parameters import refuse
 from mitsuba_irrcache.gradients.transport import AdjointTransport
-from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind, illuminating, kind_of
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, suns
 
 
 class EmitterTangents:
@@ -50,17 +50,11 @@ class EmitterTangents:
         found = []
         pairs = zip(lights.emitters, lights.irradiance, strict=True)
         for number, (emitter, irradiance) in enumerate(pairs):
-            pairs_of_channels = [(0, 0.0)] * dr.size_v(mi.Spectrum)
+            relative = [(0, 0.0)] * dr.size_v(mi.Spectrum)
             if number < lights.points and emitter in self._changes:
-                pairs_of_channels = self._relative_by_channel(emitter)
-            found.append(
-                mi.Spectrum(
-                    [
-                        dr.opaque(mi.Float, factor) * irradiance[channel]
-                        for channel, factor in pairs_of_channels
-                    ]
-                )
-            )
+                relative = self._relative_by_channel(emitter)
+            changes = [dr.opaque(mi.Float, factor) * irradiance[c] for c, factor in relative]
+            found.append(mi.Spectrum(changes))
         return found
 
     def _relative_by_channel(self, emitter: mi.Emitter) -> list[tuple[int, float]]:
@@ -85,13 +79,13 @@ class EmitterTangents:
         """Return the changes (n, 2, channels) of the irradiance that enters along the ordinates;
         None if there are none.
         """
-        suns = EmittersByKind(illuminating(self._scene)).of(EmitterKind.SUN)
-        if self._environment is None and not any(sun in self._changes for sun in suns):
+        all_suns = suns(self._scene)
+        if self._environment is None and not any(sun in self._changes for sun in all_suns):
             return None
         directions, incoming, *_ = transport.ordinates
         result = np.zeros((len(directions), 2, transport.channels))
         tracks, end = transport.lights.sun_tracks, transport.lights.even
-        for number, sun in enumerate(suns):
+        for number, sun in enumerate(all_suns):
             if sun in self._changes:
                 rows = slice(end + number * tracks, end + (number + 1) * tracks)
                 channel, factor = _relative(*self._changes[sun])

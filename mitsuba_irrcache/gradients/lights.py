@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.gradients.scattering import Components, IsotropicScattering, OrdinatePart
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind, illuminating
+from mitsuba_irrcache.lights.emitters import suns
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor, VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
@@ -38,9 +38,8 @@ class LightsOfOneDirection:
         illumination: DistantIllumination,
     ) -> None:
         self._scattering = scattering
-        suns = EmittersByKind(illuminating(scene)).of(EmitterKind.SUN)
         self.points = len(illumination.point_lights)
-        self.emitters = [*illumination.point_lights, *suns]
+        self.emitters = [*illumination.point_lights, *suns(scene)]
         voxels = dr.arange(mi.UInt32, grid.voxel_count)
         self.positions = VoxelSamplePoints(scene, grid).of(voxels)
         self.at_positions = illumination.point_irradiance(medium, self.positions)

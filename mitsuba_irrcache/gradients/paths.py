@@ -18,7 +18,13 @@ import mitsuba as mi
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.gradients.emitters import pull
 from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, RaySegments
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_solid, power_heuristic
+from mitsuba_irrcache.transport.path import (
+    MOST_CROSSINGS,
+    Media,
+    is_solid,
+    power_heuristic,
+    visibility,
+)
 
 #: Number of surfaces of a path, at most, and after which Russian roulette ends paths; smallest
 #: probability to continue.
@@ -252,7 +258,10 @@ class PathAdjoint:
         shadow = mi.Ray3f(origin.spawn_ray_to(record.p))
         shadow.d = record.d
         shadow.maxt = dr.largest(mi.Float)
-        passed = null_transmission(self._scene, mi.Ray3f(origin.spawn_ray_to(record.p)), active)
+        none, rng = dr.zeros(mi.MediumPtr), mi.PCG32()
+        passed, _ = visibility(
+            self._scene, Media([]), origin, record.p, none, rng, active, exact=True
+        )
         visible = active & (dr.max(passed) > 0)
         through = self._media.transmittance(shadow, record.dist, visible)
         return record, emitter, shadow, dr.select(visible, passed * through, 0)
@@ -453,21 +462,3 @@ def next_solid(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, hides_emitters: 
         active &= si.is_valid() & ~solid & (crossings < MOST_CROSSINGS)
     distance = dr.select(found.is_valid(), dr.dot(found.p - ray.o, ray.d), dr.inf)
     return found, distance
-
-
-@symbolic
-def null_transmission(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
-    """Return the share of the radiance that passes the surfaces between the ends of rays without
-    changing its direction, as in `transport.path.visibility`; 0 where not ``active``.
-    """
-    ahead, active, result = mi.Ray3f(ray), mi.Bool(active), mi.Spectrum(1)
-    result = dr.select(active, result, 0)
-    target, crossings = ray(ray.maxt), mi.UInt32(0)
-    while dr.hint(active, label="to an emitter"):
-        si = scene.ray_intersect(ahead, active)
-        hit = active & si.is_valid()
-        result = dr.select(hit, result * si.bsdf().eval_null_transmission(si, hit), result)
-        ahead = si.spawn_ray_to(target)
-        crossings += 1
-        active &= hit & (dr.max(result) > 0) & (crossings < MOST_CROSSINGS)
-    return dr.select(crossings < MOST_CROSSINGS, result, 0)

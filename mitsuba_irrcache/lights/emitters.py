@@ -196,6 +196,11 @@ def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
     return EmittersByKind(illuminating(scene)).of(*SPOT_LIKE)
 
 
+def suns(scene: mi.Scene) -> list[mi.Emitter]:
+    """Return the emitters of a scene that emit in a single direction from infinitely far away."""
+    return EmittersByKind(illuminating(scene)).of(EmitterKind.SUN)
+
+
 def position_of(emitter: mi.Emitter) -> np.ndarray:
     """Return the world position (3) of a point-like emitter."""
     params = mi.traverse(emitter)

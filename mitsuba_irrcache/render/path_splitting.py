@@ -10,13 +10,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.transport.path import medium_after, sample_bsdf
+from mitsuba_irrcache.transport.path import REFLECTION, medium_after, sample_bsdf
 
 #: Maximum number of reflected paths that wait, per lane.
 PLACES = 2
-#: Lobes that reflect and that transmit, without diffuse ones.
-MIRROR = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.GlossyReflection)
-CLEAR = int(mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.Null)
+#: Lobes that transmit, without diffuse ones.
+TRANSMISSION = int(
+    mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.Null
+)
 #: Throughput of either path below which one of both is chosen at random instead.
 NEGLIGIBLE = 2e-3
 
@@ -50,10 +51,10 @@ def split(
     found = sample_bsdf(si, *samples, active)
     pointer, throughput, eta, vertex = state
     flags = si.bsdf().flags()
-    both = active & ((flags & MIRROR) != 0) & ((flags & CLEAR) != 0)
+    both = active & ((flags & REFLECTION) != 0) & ((flags & TRANSMISSION) != 0)
     both &= (flags & int(mi.BSDFFlags.Diffuse)) == 0
-    transmitted = _lobe(si, samples, both, CLEAR)
-    direction, f, scale, _, pdf = _lobe(si, samples, both, MIRROR)
+    transmitted = _lobe(si, samples, both, TRANSMISSION)
+    direction, f, scale, _, pdf = _lobe(si, samples, both, REFLECTION)
     f = throughput * f
     # At total reflection the transmittance is 0 but for rounding, which differs between backends.
     both &= (dr.max(throughput * transmitted[1]) > NEGLIGIBLE) & (dr.max(f) > NEGLIGIBLE)
@@ -74,15 +75,15 @@ def _lobe(
     active: mi.Bool,
     lobes: int,
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool, mi.Float]:
-    """Sample the ``lobes`` `MIRROR` or `CLEAR` as `sample_bsdf`, but return the density of all
-    lobes: emitters are sampled for all lobes, and the weights of multiple importance sampling have
-    to sum to 1.
+    """Sample the ``lobes`` `REFLECTION` or `TRANSMISSION` as `sample_bsdf`, but return the density
+    of all lobes: emitters are sampled for all lobes, and the weights of multiple importance
+    sampling have to sum to 1.
     """
     direction, f, scale, is_vertex, density = sample_bsdf(si, *samples, active, lobes)
     wo = si.to_local(direction)
     # Some BSDFs, such as "mask", sample lobes that were not asked for.
     reflects = wo.z * si.wi.z > 0
-    f = dr.select(reflects if lobes == MIRROR else ~reflects, f, 0)
+    f = dr.select(reflects if lobes == REFLECTION else ~reflects, f, 0)
     glossy = active & (density > 0)
     density = dr.select(glossy, si.bsdf().pdf(mi.BSDFContext(), si, wo, glossy), 0)
     return direction, f, scale, is_vertex, density

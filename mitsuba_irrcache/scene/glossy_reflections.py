@@ -13,7 +13,7 @@ import numpy as np
 from mitsuba_irrcache.lights.narrow_sources import Source, sources_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import bounding_sphere
-from mitsuba_irrcache.transport.path import flags_of, is_null, transmits
+from mitsuba_irrcache.transport.path import REFLECTION, flags_of, is_null, transmits
 
 #: Solid angle [sr] of reflected beams below which ordinates do not resolve them. Fog over a floor
 #: of roughness 0.05, 0.1 and 0.2 under a sun has errors of 25, 2 and 0.4 % with 64 directions.
@@ -28,15 +28,13 @@ CROSSINGS = 16
 #: share of the hits with beams into the medium for which it is the same.
 SAME, FEWEST, LEAST_SHARE = 0.1, 8, 0.25
 
-_REFLECTION = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.GlossyReflection)
-
 
 def narrow_beam(scene: mi.Scene, medium: MediumGrid) -> str | None:
     """Return a description of a source that surfaces reflect into ``medium`` by a beam narrower
     than `NARROW`; None without any.
     """
     # The BSDFs of instances are those of their groups.
-    if not any(flags_of(s) & _REFLECTION or s.class_name() == "Instance" for s in scene.shapes()):
+    if not any(flags_of(s) & REFLECTION or s.class_name() == "Instance" for s in scene.shapes()):
         return None
     sources, _ = sources_of(scene)
     if not sources:
@@ -46,7 +44,7 @@ def narrow_beam(scene: mi.Scene, medium: MediumGrid) -> str | None:
     # What glass around a medium reflects inside does not come straight from a source.
     flags = si.bsdf().flags()
     reflects = si.is_valid() & ~(si.is_medium_transition() & transmits(flags))
-    reflects &= (flags & _REFLECTION) != 0
+    reflects &= (flags & REFLECTION) != 0
     for source in sources:
         towards, cosine = source.seen_from(si.p)
         n = dr.select(dr.dot(si.n, si.to_world(si.wi)) < 0, -si.n, si.n)

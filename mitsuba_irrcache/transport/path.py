@@ -18,6 +18,8 @@ from mitsuba_irrcache.transport.tracking import free_flight, medium_transmittanc
 
 #: Maximum number of surface crossings of a path; coincident surfaces could otherwise loop forever.
 MOST_CROSSINGS = 1024
+#: Lobes of BSDFs that reflect, without diffuse ones.
+REFLECTION = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.GlossyReflection)
 #: Maximum survival probability of Russian roulette, as in ``volpath``.
 MAX_SURVIVAL = 0.95
 

@@ -72,14 +72,6 @@ def test_nothing_can_be_changed(scenes):
     assert denser.macrocells is not medium.macrocells
 
 
-@pytest.fixture
-def logged(monkeypatch) -> list[str]:
-    """Record what is logged."""
-    texts: list[str] = []
-    monkeypatch.setattr(mi, "Log", lambda _, text: texts.append(text))
-    return texts
-
-
 @pytest.mark.parametrize(("height", "expected"), [(-1.0, True), (-1.01, False), (-0.5, False)])
 def test_surfaces_in_a_face_of_the_boundary_are_named(scenes, logged, height, expected):
     """A floor in the plane of a face, and a cube that has a face there but lies elsewhere."""

@@ -1,4 +1,4 @@
-"""Beams of suns that flat glossy surfaces reflect into a medium, and the solver chosen for them."""
+"""Beams that glossy surfaces reflect into a medium, and the solver chosen for them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,6 @@ from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import compile_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
-
-
-@pytest.fixture
-def logged(monkeypatch) -> list[str]:
-    """Return the messages that are logged."""
-    found: list[str] = []
-    monkeypatch.setattr(mi, "Log", lambda level, text: found.append(text))
-    return found
 
 
 SUN = {"type": "directional", "direction": [0.4, -1.0, 0.55]}
