@@ -54,14 +54,6 @@ def check(parts: list[CachedMedium], keys: list[str]) -> None:
         refuse_all(keys, "a medium is not visible to the camera", "Remove that medium")
     for part in parts:
         _check_medium(part, keys)
-    for part in parts:
-        for other in parts:
-            if part is not other and _reaches_into(part, other):
-                refuse_all(
-                    keys,
-                    f'medium "{part.medium.name}" reaches into medium "{other.medium.name}"',
-                    "Move them apart",
-                )
 
 
 def _check_medium(part: CachedMedium, keys: list[str]) -> None:
@@ -73,10 +65,8 @@ def _check_medium(part: CachedMedium, keys: list[str]) -> None:
         refuse_all(keys, f"{name} is emissive {among}", "Remove the emission")
     if medium.refracts:
         refuse_all(keys, f"the boundary of {name} refracts", "Give it a null BSDF")
-    if medium.boundary.kind not in ("box", "sphere") or not medium.has_exact_boundary:
-        refuse_all(
-            keys, f"the boundary of {name} is neither a box nor a sphere", "Use one of these"
-        )
+    if part.shared is not None:
+        refuse_all(keys, part.shared, "Use a box or sphere that nothing reaches into")
     if part.cache is None:
         refuse_all(keys, f"{name} is opaque and homogeneous, and has no cache", "Set resolution")
     if not part.solver.has_gradients:
@@ -87,12 +77,6 @@ def _check_medium(part: CachedMedium, keys: list[str]) -> None:
     for light in part.description.emitters.of(*POINT_LIKE):
         if lies_in(light, part.cache.grid):
             refuse_all(keys, f'emitter "{light.id()}" is in {name} {among}', "Move it out")
-
-
-def _reaches_into(part: CachedMedium, other: CachedMedium) -> bool:
-    grid = part.cache.grid
-    p = grid.centers(dr.arange(mi.UInt32, grid.voxel_count))
-    return bool(dr.any(part.medium.contains(p) & other.medium.contains(p)))
 
 
 class TracedAdjoint:

@@ -23,6 +23,20 @@ def marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
     return marks
 
 
+def dilated(grid: Grid, marks: mi.Bool) -> mi.Bool:
+    """Extend a mask of the voxels of ``grid`` by all their neighbours, diagonal ones included."""
+    voxel = dr.arange(mi.UInt32, grid.voxel_count)
+    for axis in range(3):
+        dr.eval(marks)
+        found, place = mi.Bool(marks), list(grid.voxel_indices(voxel))
+        at, last = place[axis], mi.UInt32(grid.sides[axis]) - 1
+        for exists, beside in ((at > 0, at - 1), (at < last, at + 1)):
+            place[axis] = beside
+            found |= dr.gather(mi.Bool, marks, grid.index(*place), exists)
+        marks = found
+    return marks
+
+
 def active_voxels(medium, grid: Grid) -> mi.UInt32:
     """Return the ascending flat indices of the voxels of ``grid`` that lookups at positions with
     sigma_t > 0 can read.

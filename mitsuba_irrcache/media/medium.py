@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 
 import drjit as dr
@@ -196,10 +197,30 @@ class MediumGrid(Immutable):
         """Shortest voxel edge of the extinction [scene units]; infinite if it is constant."""
         return dr.inf if self.homogeneous else float(self.sigma_t.grid.voxel_size.min())
 
+    @property
+    def clips(self) -> Callable[[mi.Point3f], mi.Bool] | None:
+        """Function that returns whether world positions lie within ``bbox``; None if unbounded."""
+        return None if self.bbox is None else self._clip.contains
+
     def contains(self, p: mi.Point3f) -> mi.Bool:
-        """Return whether world positions lie in the medium."""
+        """Return whether world positions lie within the boundary and ``bbox``: in the medium, if
+        its boundary is exact.
+        """
         inside = self.boundary.surrounds(p)
         return inside if self.bbox is None else inside & self._clip.contains(p)
+
+    def overlaps(self, other: MediumGrid) -> bool:
+        """Return whether the boxes around both media may overlap, by their extents along the
+        world's axes.
+        """
+        (low, high), (least, most) = (
+            (
+                m[:3, 3] + np.minimum(m[:3, :3], 0).sum(axis=1),
+                m[:3, 3] + np.maximum(m[:3, :3], 0).sum(axis=1),
+            )
+            for m in (self.frame, other.frame)
+        )
+        return bool((low < most).all() and (least < high).all())
 
     def fills(self, grid: Grid) -> bool:
         """Return whether the medium fills the whole box covered by ``grid``."""
@@ -210,7 +231,7 @@ class MediumGrid(Immutable):
             inside = all(self.boundary.contains(np.array(corner)) for corner in corners)
             is_whole = inside and self.has_exact_boundary
         else:
-            is_whole = self.boundary.kind == "box"
+            is_whole = self.boundary.kind == "box" and self.has_exact_boundary
         same = np.abs(box - grid.to_world).max() <= 1e-6 * grid.side_lengths.max()
         return is_whole and bool(same)
 

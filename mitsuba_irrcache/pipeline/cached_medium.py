@@ -27,7 +27,7 @@ from mitsuba_irrcache.cache.peak_depths import PeakDepths
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.grids.occupancy import active_voxels, marked
+from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.lights.emitters import EmitterKind, position_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.lights.narrow_sources import MAX_LAMPS, sources_of
@@ -36,6 +36,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.fingerprint import differing, digests
+from mitsuba_irrcache.scene.media_shares import why_shared
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask
 from mitsuba_irrcache.solvers.grid_size import (
@@ -112,6 +113,8 @@ class CachedMedium:
         self.cache: IrradianceCache | None = None
         #: closed form that replaces the cache; None if there is a cache, or no scattering
         self.half_space: HalfSpace | None = None
+        #: why the medium does not fill a box or sphere alone; None if it does, see `why_shared`
+        self.shared: str | None = None
         #: grid of the cache; None if no cache is needed
         self.grid: Grid | None = None
         if settings.max_depth in (0, 1):
@@ -235,6 +238,8 @@ class CachedMedium:
             warn_of_dense_border(medium, grid, settings.max_depth)
             if not warn_of_opaque_voxels(medium, grid, settings.max_depth):
                 warn_of_unresolved_detail(medium, grid)
+        whole = np.zeros(3, int), grid.resolution
+        self.shared = None if medium.is_isolated else why_shared(scene, medium, grid, whole)
         active, classes = self._active_voxels(scene, grid)
         self._log_choices(grid, self._size_reason, dr.width(active))
         samples = settings.samples or solver.default_samples(
@@ -307,7 +312,7 @@ class CachedMedium:
         classification of all voxels by surfaces and media (None without any among them).
         """
         medium = self.medium
-        active = active_voxels(medium, grid)
+        active = self.solver.active_voxels(scene, medium, grid)
         classes = self.solver.voxel_classes(scene, self.description.media, medium, grid, active)
         if classes is not None:
             active = dr.compress(classes.readable & marked(grid, active))

@@ -18,6 +18,7 @@ from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import active_voxels
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
@@ -140,6 +141,13 @@ class Solver(ABC):
         that take the same processor time: a lower estimate, or 0 if ``volpath`` is never faster.
         """
         return 0.0
+
+    @classmethod
+    def active_voxels(cls, scene: mi.Scene, medium: MediumGrid, grid: Grid) -> mi.UInt32:
+        """Return the ascending flat indices of the voxels of ``grid`` that need values, if surfaces
+        are ignored: those that lookups in ``medium`` can read, at least.
+        """
+        return active_voxels(medium, grid)
 
     @classmethod
     def voxel_classes(

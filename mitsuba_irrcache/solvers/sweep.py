@@ -9,11 +9,12 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.grids.occupancy import active_voxels, occupied_box
+from mitsuba_irrcache.grids.occupancy import active_voxels, dilated, marked, occupied_box
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, illuminating, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.glossy_reflections import narrow_beam
-from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
+from mitsuba_irrcache.scene.media_shares import media_shares, media_within, why_shared
+from mitsuba_irrcache.scene.occluders import obstacle
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
@@ -53,8 +54,8 @@ FIXED_COST, DIRECTION_COST = 5e5, 0.05
 
 @register
 class SweepSolver(Solver):
-    """Solves for all voxels at once, in media that fill a box or sphere and that no other medium
-    reaches into. Surfaces may reach into media that scatter isotropically and do not emit.
+    """Solves for all voxels at once. Surfaces and other media may reach into media that scatter
+    isotropically and do not emit.
     """
 
     name = "sweep"
@@ -85,24 +86,19 @@ class SweepSolver(Solver):
                 )
         if medium.is_isolated:
             return None
-        if not medium.has_exact_boundary:
-            return f"{name} is bounded by other shapes than one box or sphere"
         if max_depth > 2:
             return (
                 "among surfaces it computes single scattering (max_depth 2) or all orders (-1), "
                 f"not max_depth {max_depth}"
             )
         grid, _ = choose_grid(medium, resolution, cls.size_rule)
-        active = active_voxels(medium, grid)
+        active = cls.active_voxels(scene, medium, grid)
         if not dr.width(active):
             return None
         box = occupied_box(grid, active)
-        for other in medium.others:
-            if boxes_meet(grid, *box, corners_of(other.frame)):
-                return f'medium "{other.name}" reaches into {name}'
-        hole = hole_in(scene, medium, grid, box)
-        if hole:
-            return f"{hole} is a hole in {name}, or bounds another medium in it"
+        shared = why_shared(scene, medium, grid, box)
+        if shared is not None:
+            return _why_no_mixture(scene, medium, grid, box, shared)
         if medium.phase.is_isotropic and medium.emission is None:
             return None
         if medium.refracts and not medium.phase.is_isotropic and is_needed(scene):
@@ -117,6 +113,19 @@ class SweepSolver(Solver):
         return found and f"{found} reaches into {name}, which {what}"
 
     @classmethod
+    def active_voxels(cls, scene: mi.Scene, medium: MediumGrid, grid: Grid) -> mi.UInt32:
+        found, whole = active_voxels(medium, grid), (np.zeros(3, int), grid.resolution)
+        if medium.is_isolated or not dr.width(found) or not why_shared(scene, medium, grid, whole):
+            return found
+        # Lookups read voxels beside those that the medium fills. In the others radiance is
+        # scattered, too.
+        own, *others = media_shares(scene, media_within(medium, grid, whole), grid)
+        marks = marked(grid, found) & dilated(grid, own > 0)
+        for share in others:
+            marks |= share > 0
+        return dr.compress(marks)
+
+    @classmethod
     def weakness(cls, scene: mi.Scene, medium: MediumGrid, max_depth: int) -> str | None:
         if medium.is_isolated or 0 <= max_depth <= 2:
             return None
@@ -126,7 +135,7 @@ class SweepSolver(Solver):
     def why(cls, medium: MediumGrid) -> str:
         if medium.is_isolated:
             return "all emitters are distant or point-like"
-        return "no other medium is among the voxels"
+        return "all emitters are supported among surfaces"
 
     @classmethod
     def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
@@ -153,9 +162,11 @@ class SweepSolver(Solver):
         # Extinction with its neighbours, the radiance along tracks, sums and spreads; and for
         # further orders of scattering, the values of voxels and those stored between sweeps.
         once = max_depth == 2
-        sets = channels if sn_solver.swept_together(medium, voxels, moments) else 1
+        extinctions = max(each.sigma_t.channels for each in (medium, *medium.others))
+        sets = channels if sn_solver.swept_together(extinctions, voxels, moments) else 1
         numbers = 5 + 2 * channels + (0 if once else 5 + 12 * sets + 3 * channels)
-        if voxels <= MOST_REFINED and medium.boundary.kind != "box":
+        is_box = medium.boundary.kind == "box" and medium.has_exact_boundary
+        if voxels <= MOST_REFINED and (not is_box or medium.others):
             numbers += 32  # the extinction may have half the edges
         return numbers + moments * (3 * channels + (4 if once else 10) * sets)
 
@@ -181,7 +192,9 @@ class SweepSolver(Solver):
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        return True
+        if medium.is_isolated or not dr.width(active):
+            return True
+        return why_shared(scene, medium, grid, occupied_box(grid, active)) is None
 
     def __init__(self, task: SolverTask) -> None:
         kind = Sweep if task.cache.directional is None else AnisotropicSweep
@@ -193,3 +206,22 @@ class SweepSolver(Solver):
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         self._sweep.refine(samples, progress)
+
+
+def _why_no_mixture(
+    scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple, shared: str
+) -> str | None:
+    """Return why a `MediaMixture` does not represent ``medium`` in the ``box`` (lower, upper) of
+    voxels of ``grid``; None if it does. ``shared`` is why one is needed.
+    """
+    media = media_within(medium, grid, box)
+    for each in media:
+        name = f'medium "{each.name}"'
+        if each.refracts:
+            return f"{shared}, and the boundary of {name} refracts"
+        if each.emission is not None:
+            return f"{shared}, and {name} is emissive"
+        if len(media) > 1 and not each.phase.is_isotropic:
+            return f"{shared}, and {name} scatters anisotropically"
+    found = obstacle(scene, grid, *box)
+    return found and f'{shared}, and {found} reaches into medium "{medium.name}"'

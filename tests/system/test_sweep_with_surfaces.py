@@ -222,8 +222,8 @@ def test_point_light_and_several_media(scenes):
 
 
 def test_the_choice_of_solver(scenes):
-    """``auto`` selects sweep unless other media reach into the medium, or objects into one that
-    scatters anisotropically, or max_depth is small.
+    """``auto`` selects sweep unless objects or other media reach into a medium that scatters
+    anisotropically, or objects into one that other media reach into, or max_depth is small.
 
     A request for ``sweep`` in these cases is refused with the reason.
     """
@@ -235,10 +235,13 @@ def test_the_choice_of_solver(scenes):
     around = {"shape": shape | {"interior": mi.load_dict(shape["interior"])}}
     other = scenes.boundary(scenes.medium(1.0, 0.9), scenes.placement((1, 1, 1)))
     around["other"] = other | {"exterior": around["shape"]["interior"]}
+    sharp = {"shape": shape | {"interior": mi.load_dict(forward["interior"])}}
+    sharp["other"] = other | {"exterior": sharp["shape"]["interior"]}
     refused = {
         '"ball".*reaches into.*anisotropically': {"ball": ball, "shape": forward},
         '"veil".*reaches into.*anisotropically': {"veil": veil, "shape": forward},
-        "medium.*reaches into": around,
+        "medium.*reaches into.*scatters anisotropically": sharp,
+        'medium.*reaches into.*"ball".*reaches into': around | {"ball": ball},
         "max_depth 4": {},
     }
     for reason, more in refused.items():
@@ -248,10 +251,11 @@ def test_the_choice_of_solver(scenes):
         assert choose_solver(scene, medium, "auto", depth)[0].name == "path"
         with pytest.raises(IrrcacheError, match=f"(?s)sweep.*{reason}.*path"):
             filled(scene, max_depth=depth)
-    for objects in (scene_occluder(scenes), scene_sky(scenes) | {"ball": ball, "veil": veil}):
+    among = scene_sky(scenes) | {"ball": ball, "veil": veil}
+    for objects in (scene_occluder(scenes), among, scene_sky(scenes) | around):
         scene = load(scenes, objects)
-        (medium,) = compile_scene(scene).visible
-        assert choose_solver(scene, medium, "auto")[0].name == "sweep"
+        for medium in compile_scene(scene).visible:
+            assert choose_solver(scene, medium, "auto")[0].name == "sweep"
 
 
 def test_standard_error_is_the_scatter(scenes):

@@ -68,7 +68,8 @@ class SurfaceBoundary:
     ``area_emitters`` are the emitters that tracks hit by chance; radiance that comes straight from
     other emitters is sampled from the voxels instead. ``rr_depth`` applies to paths.
     ``angular_basis`` is None for isotropic scattering. ``surfaces`` are the voxels near surfaces,
-    None without any.
+    None without any. ``within`` are other media, which lie in the box of ``medium`` and are part of
+    the solution there.
     """
 
     def __init__(
@@ -79,10 +80,12 @@ class SurfaceBoundary:
         rr_depth: int,
         angular_basis: AngularBasis | None = None,
         surfaces: SurfaceVoxels | None = None,
+        within: Sequence[MediumGrid] = (),
     ) -> None:
         self.surfaces = surfaces
         self.scene, self.medium, self.media = scene, medium, Media.around(medium)
         self.pointer, self.area_emitters = medium.pointer, list(area_emitters)
+        self._solved = [medium.pointer, *(other.pointer for other in within)]
         #: the other media; ``medium`` is convex, so a straight ray that leaves it never returns.
         #: Rays through transmitting surfaces among the voxels continue in it.
         self.other_media = self.media.without(medium)
@@ -102,11 +105,16 @@ class SurfaceBoundary:
 
     @property
     def paths(self) -> PathTracer:
-        """Tracer of paths in the current scene that end at their first collision in the medium."""
-        own = self.pointer
-        return PathTracer(
-            self.scene, self.media, *self._depths, is_cached=lambda other: other == own
-        )
+        """Tracer of paths in the current scene that end at their first collision in a medium of the
+        solution.
+        """
+        return PathTracer(self.scene, self.media, *self._depths, is_cached=self._is_solved)
+
+    def _is_solved(self, pointer: mi.MediumPtr) -> mi.Bool:
+        found = mi.Bool(False)
+        for own in self._solved:
+            found |= pointer == own
+        return found
 
     def crossings(self, tracks: Tracks, ordinates: Ordinates) -> SurfaceCrossings | None:
         """Return the crossings of tracks along ``ordinates`` with surfaces among the voxels."""

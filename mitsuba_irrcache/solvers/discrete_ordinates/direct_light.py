@@ -25,6 +25,7 @@ from mitsuba_irrcache.core.spectrum import channel_mean
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, varies_in_space
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
@@ -85,10 +86,15 @@ class EmitterSampling:
         point_lights: Sequence[mi.Emitter],
         p: mi.Point3f,
         angular_basis: AngularBasis | None = None,
+        is_shared: bool = False,
     ) -> None:
+        """``is_shared`` states that positions in the box of ``medium`` may be in other media, or in
+        none.
+        """
         self.scene, self.medium, self.p = scene, medium, p
-        self.angular_basis = angular_basis
-        self._other_media = Media.around(medium).without(medium)
+        self.angular_basis, self._is_shared = angular_basis, is_shared
+        self._media = Media.around(medium)
+        self._other_media = self._media.without(medium)
         self._small = len(small)
         self._is_textured = any(varies_in_space(emitter) for emitter in small)
         if small:
@@ -168,6 +174,12 @@ class EmitterSampling:
         else:
             record, irradiance = emitter.sample_direction(vertex, sample)
         visible = dr.max(irradiance) > 0
+        if self._is_shared:
+            pointer = probe(self.scene, p, record.d)
+            passed, rng = visibility(
+                self.scene, self._media, vertex, record.p, pointer, rng, visible, exact=True
+            )
+            return dr.select(visible, irradiance * passed, 0), record.d, rng
         # The transmittance of this medium is integrated separately, without noise.
         passed, rng = visibility(
             self.scene, self._other_media, vertex, record.p, medium.pointer, rng, visible

@@ -4,6 +4,8 @@ optical depth, and the albedo of collisions.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -37,9 +39,7 @@ def extinction_grid(medium: MediumGrid, grid: Grid, has_dense_boundary: bool = F
     """
     data = medium.sigma_t.grid
     if not medium.fills(grid):
-        if has_dense_boundary and grid.voxel_count <= MOST_REFINED:
-            return Grid(tuple(DETAIL * n for n in grid.shape), grid.to_world)
-        return grid
+        return halved(grid) if has_dense_boundary else grid
     if data is None or not medium.fills(data):
         return grid
     block = np.maximum(np.rint(data.resolution / (DETAIL * grid.resolution)), 1).astype(int)
@@ -48,6 +48,13 @@ def extinction_grid(medium: MediumGrid, grid: Grid, has_dense_boundary: bool = F
     if (sides == grid.resolution).all():
         return grid
     return data if (block == 1).all() else Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
+
+
+def halved(grid: Grid) -> Grid:
+    """Return the grid of half the edges, or ``grid`` if it has too many voxels."""
+    if grid.voxel_count > MOST_REFINED:
+        return grid
+    return Grid(tuple(DETAIL * n for n in grid.shape), grid.to_world)
 
 
 def resampled(
@@ -67,7 +74,21 @@ def resampled(
     ratio = 1.0 if field.grid is None else (grid.voxel_size / field.grid.voxel_size).max()
     points = int(np.clip(np.ceil(ratio - 1e-3), points_if_cut if cut else 1, FINEST))
     index = dr.arange(mi.UInt32, grid.voxel_count)
-    values = _mean(medium, field, grid, index, points, cut)
+    values = _mean(field, grid, index, points, medium.contains if cut else None)
+    dr.eval(values)
+    return values
+
+
+def mean_extinction(medium: MediumGrid, grid: Grid) -> list[mi.Float]:
+    """Return the channels of the extinction at the voxels of ``grid``, means over voxels that
+    count as filled by the ``medium`` within the box of its data, whatever its boundary.
+    """
+    data = medium.sigma_t.grid
+    ratio = 1.0 if data is None else (grid.voxel_size / data.voxel_size).max()
+    fewest = 1 if medium.bbox is None else FINEST
+    points = int(np.clip(np.ceil(ratio - 1e-3), fewest, FINEST))
+    index = dr.arange(mi.UInt32, grid.voxel_count)
+    values = _mean(medium.sigma_t, grid, index, points, medium.clips)
     dr.eval(values)
     return values
 
@@ -84,6 +105,21 @@ def collision_albedo(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[
 
     The weight matters where albedo and extinction change together, at the edges of objects.
     """
+    contains = None if medium.fills(grid) else medium.contains
+    return _albedo_of_collisions(medium, grid, voxels, contains)
+
+
+def mean_albedo(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[mi.Float]:
+    """Return `collision_albedo` of voxels that count as filled by the ``medium`` within the box of
+    its data, whatever its boundary.
+    """
+    return _albedo_of_collisions(medium, grid, voxels, medium.clips)
+
+
+def _albedo_of_collisions(
+    medium: MediumGrid, grid: Grid, voxels: mi.UInt32, contains: Callable | None
+) -> list[mi.Float]:
+    """Return the albedo of collisions where a medium ``contains`` positions (None: everywhere)."""
     albedo, extinction = medium.albedo, medium.sigma_t
     if albedo.grid is None:
         none, values = dr.zeros(mi.Float, dr.width(voxels)), mi.Spectrum(albedo.value)
@@ -91,7 +127,7 @@ def collision_albedo(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[
     fields = [f.grid for f in (albedo, extinction) if f.grid is not None]
     ratio = max((grid.voxel_size / data.voxel_size).max() for data in fields)
     parts = int(np.clip(np.ceil(ratio - 1e-3), 1, FINEST // 2))
-    values = _extinction_weighted_albedo(medium, grid, voxels, parts, not medium.fills(grid))
+    values = _extinction_weighted_albedo(medium, grid, voxels, parts, contains)
     dr.eval(values)
     return values
 
@@ -111,8 +147,10 @@ def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
 
 
 @symbolic
-def _mean(medium, field, grid, index, points: int, cut: bool):
-    """Return means of ``field`` over points^3 positions in the voxels ``index``, per channel."""
+def _mean(field, grid, index, points: int, contains):
+    """Return means of ``field`` over points^3 positions in the voxels ``index``, per channel;
+    positions count where a medium ``contains`` them (None: all do).
+    """
     corner, sides = mi.Point3f(*grid.voxel_indices(index)), [Divisor(points)] * 2
     points, count = dr.opaque(mi.Float, points), dr.opaque(mi.UInt32, points**3)
     sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
@@ -121,8 +159,8 @@ def _mean(medium, field, grid, index, points: int, cut: bool):
         place = mi.Point3f(*unravelled(k, sides)) + 0.5
         p = grid.world.point(corner + place / points)
         value = field.at_world(p)
-        if dr.hint(cut, mode="scalar"):
-            value = dr.select(medium.contains(p), value, 0)
+        if dr.hint(contains is not None, mode="scalar"):
+            value = dr.select(contains(p), value, 0)
         for c in range(field.channels):
             part = value if dr.hint(field.channels == 1, mode="scalar") else value[c]
             sums[c] = sums[c] + part
@@ -131,7 +169,7 @@ def _mean(medium, field, grid, index, points: int, cut: bool):
 
 
 @symbolic
-def _extinction_weighted_albedo(medium, grid, index, parts: int, cut: bool):
+def _extinction_weighted_albedo(medium, grid, index, parts: int, contains):
     """Return means of the albedo over the voxels ``index``, weighted by extinction, with the
     quadrature `RADAU` in ``parts`` parts along each axis.
     """
@@ -152,8 +190,8 @@ def _extinction_weighted_albedo(medium, grid, index, parts: int, cut: bool):
         p = grid.world.point(corner + mi.Point3f(within) / parts)
         sigma_t = mi.Spectrum(medium.sigma_t.at_world(p)) * weight
         albedo = mi.Spectrum(medium.albedo.at_world(p))
-        if dr.hint(cut, mode="scalar"):
-            sigma_t = dr.select(medium.contains(p), sigma_t, 0)
+        if dr.hint(contains is not None, mode="scalar"):
+            sigma_t = dr.select(contains(p), sigma_t, 0)
         for c in range(channels):
             collided[c] = collided[c] + sigma_t[c]
             scattered[c] = scattered[c] + sigma_t[c] * albedo[c]

@@ -30,6 +30,7 @@ from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.media_shares import media_in, media_within, why_shared
 from mitsuba_irrcache.solvers.base import Progress
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import merged
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
@@ -49,6 +50,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.incident import (
     samples_in_isolated_media,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import interleaved_channels
+from mitsuba_irrcache.solvers.discrete_ordinates.mixture import MediaMixture, SingleMedium
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
     BoundaryOrdinateSet,
@@ -58,12 +60,6 @@ from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
 from mitsuba_irrcache.solvers.discrete_ordinates.refracted_light import (
     is_needed,
     refracted_irradiance,
-)
-from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
-    collision_albedo,
-    extinction_grid,
-    resampled,
-    track_extinction,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, means_at_faces
 
@@ -81,12 +77,12 @@ MOST_SWEPT_TOGETHER = 1 << 24
 NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
 
 
-def swept_together(medium: MediumGrid, voxels: int, moments: int) -> bool:
-    """Return whether all channels of a cache with this number of ``voxels`` and of angular
-    ``moments`` (0: the irradiance alone) are swept at once.
+def swept_together(extinctions: int, voxels: int, moments: int) -> bool:
+    """Return whether all channels of a cache with this number of channels of the extinction, of
+    ``voxels`` and of angular ``moments`` (0: the irradiance alone) are swept at once.
     """
     unknowns = voxels * max(1, moments)
-    return medium.sigma_t.channels == 1 and unknowns <= MOST_SWEPT_TOGETHER
+    return extinctions == 1 and unknowns <= MOST_SWEPT_TOGETHER
 
 
 def batch_of(samples: int, multiple: int) -> int:
@@ -128,7 +124,11 @@ class Sweep:
         # The tracks come first: `occupied_box` evaluates the coordinates of all voxels, which the
         # sample points would otherwise share and store.
         self._surfaces = _surfaces_among(scene, cache, medium if medium.refracts else None)
-        self._prepare_tracks(pause)
+        box = occupied_box(cache.grid, cache.active)
+        #: whether boundaries that are not in closed form, or of other media, divide voxels
+        self._is_shared = not medium.is_isolated and not medium.refracts
+        self._is_shared &= why_shared(scene, medium, cache.grid, box) is not None
+        self._prepare_tracks(scene, pause)
         self._sample_points = VoxelSamplePoints(scene, cache.grid).of(cache.active)
         if medium.refracts:
             self._sample_points = medium.boundary.drawn_inside(self._sample_points)
@@ -179,8 +179,9 @@ class Sweep:
             [emitter for emitter in emitters if emitter not in known]
             for emitters in split_by_solid_angle(scene, cache.grid, *box)
         )
+        within = media_in(medium, cache.grid) if self._is_shared else ()
         self._boundary = SurfaceBoundary(
-            scene, medium, large, rr_depth, cache.directional, self._surfaces
+            scene, medium, large, rr_depth, cache.directional, self._surfaces, within
         )
         # Moments of the radiance in cut voxels are those at the centre.
         if self._surfaces is not None and known and cache.max_depth != 2 and not cache.moments:
@@ -193,7 +194,7 @@ class Sweep:
             self._boundary.carries_refracted = False
         emitters = small, self._illumination.point_lights
         self._emitter_sampling = EmitterSampling(
-            scene, medium, *emitters, self._sample_points, cache.directional
+            scene, medium, *emitters, self._sample_points, cache.directional, self._is_shared
         )
         points = self._emitter_sampling.from_points
         self._from_points = [self._with_means_at_faces(irradiance) for irradiance in points]
@@ -207,7 +208,7 @@ class Sweep:
         layers = self._tracks[0].layers
         return means_at_faces(irradiance, self.cache.grid, self.cache.active, layers)
 
-    def _prepare_tracks(self, pause: Callable[[], None]) -> None:
+    def _prepare_tracks(self, scene: mi.Scene, pause: Callable[[], None]) -> None:
         """Create the tracks for each channel of the extinction, and resample extinction and albedo
         for multiple scattering.
         """
@@ -217,13 +218,17 @@ class Sweep:
             medium = medium.replaced(boundary=Boundary("box", medium.boundary.to_world))
         border = cache.interpolation.border
         is_dense = border is not None
-        detail = extinction_grid(medium, grid, is_dense)
-        extinction = track_extinction(medium, grid, detail)
         box = occupied_box(grid, cache.active)
+        voxels = SingleMedium(medium)
+        if self._is_shared:
+            voxels = MediaMixture(scene, media_within(medium, grid, box))
+        detail = voxels.extinction_grid(grid, is_dense)
+        extinction = voxels.extinction(detail, grid)
         # The extinction of blocks of the medium's voxels, or of rotated voxels, may extend beyond
         # the active voxels.
         data = medium.sigma_t.grid
         sparse = data is not None and detail.shape == data.shape and medium.fills(grid)
+        sparse &= not self._is_shared
         # With further orders, the sum of uncollided and scattered irradiance does not depend on it.
         has_dense_faces = is_dense and border.is_at_faces and cache.max_depth == 2
         rest = *box, detail, cache.active, sparse, pause, self._surfaces, has_dense_faces
@@ -233,9 +238,9 @@ class Sweep:
         self._sigma_t = self._albedo = [mi.Float(0)]
         if cache.max_depth != 2 or self._surfaces is not None:
             if detail is not grid:
-                extinction = resampled(medium, medium.sigma_t, grid)
+                extinction = voxels.extinction(grid, grid)
             self._sigma_t = self._at_active(extinction)
-            self._albedo = collision_albedo(medium, grid, cache.active)
+            self._albedo = voxels.albedo(grid, cache.active)
             if self._surfaces is not None:
                 # Without this, corrections from coarser grids would leave small irradiance within
                 # objects, and lookups next to them would not replace it by that of neighbours.
@@ -373,7 +378,8 @@ class Sweep:
     def _channel_groups(self, grey: bool) -> list[tuple[int, ...]]:
         """Return groups of channels that are swept together; only the first channel if ``grey``."""
         channels = range(1 if grey else self.cache.channels)
-        if swept_together(self._medium, self.cache.grid.voxel_count, self.cache.moments):
+        voxels, moments = self.cache.grid.voxel_count, self.cache.moments
+        if swept_together(len(self._tracks), voxels, moments):
             return [tuple(channels)]
         return [(c,) for c in channels]
 
