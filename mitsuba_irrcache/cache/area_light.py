@@ -60,6 +60,8 @@ POSITIONS = 64
 #: interpolated.
 MOST_LIGHTS, MOST_VALUES, VALUES = 8, 14 << 24, 14
 
+#: Difference of the shares of a channel below which irradiances have the same colour.
+SAME_COLOUR = 1e-3
 #: Lines from a position to an emitter whose lengths in the medium divide optical depths: that to
 #: the closest point, those to several points, or none. With "each", transmittances of the mean
 #: extinction are averaged over points instead (docs/primer, eq. (2.10)).
@@ -313,9 +315,9 @@ class AreaLight(DirectLight):
         mean, bias = _mean_and_bias(*sums)
         depth = -dr.log(dr.maximum(mean, 1e-30)) - bias
         depth = depth[0] if self._medium.sigma_t.channels == 1 else mi.Color3f(depth)
-        seen = dr.mean(visible)
+        seen = visible if self._is_coloured else mi.Spectrum(dr.mean(visible))
         share = dr.select(seen > 0, 1 / dr.select(seen > 0, seen, 1), 0)
-        self._angular_means = [share * total for total in angular]
+        self._angular_means = [share * mi.Spectrum(total) for total in angular]
         dr.eval(depth, passed, self._angular_means)
         return depth, passed
 
@@ -344,8 +346,14 @@ class AreaLight(DirectLight):
         required = FEWEST_SAMPLES * np.sqrt(bias / LARGEST_BIAS)
         return int(np.clip(np.ceil(required), permitted, most))
 
-    def angular_means(self) -> list[mi.Float]:
+    def angular_means(self) -> list[mi.Spectrum]:
         return self._angular_means
+
+    @property
+    def _is_coloured(self) -> bool:
+        """Whether media may attenuate the emitter's channels differently."""
+        media = self._medium, *self._medium.others
+        return any(medium.sigma_t.channels > 1 for medium in media)
 
     @property
     def has_one_direction(self) -> bool:
@@ -410,15 +418,17 @@ class AreaLight(DirectLight):
 
         Returns six sums: W times the transmittance T of the medium; W times T times the visibility
         V past surfaces and other media; W; the first and the third sum over every other point; and
-        the list of the sums of W T V, averaged over the channels, times each spherical harmonic of
-        the direction to the point, from degree 1 to ``order``.
+        the list of the sums of W T V, averaged over the channels unless media are coloured, times
+        each spherical harmonic of the direction to the point, from degree 1 to ``order``.
         """
         vertex = dr.zeros(mi.Interaction3f, dr.width(p))
         vertex.p = p
         shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
         transmitted, visible, total = mi.Spectrum(0), mi.Spectrum(0), mi.Float(0)
         odd, odd_total = mi.Spectrum(0), mi.Float(0)
-        angular = [mi.Float(0) for _ in range(order * (order + 2))]
+        coloured = self._is_coloured
+        kind = mi.Spectrum if coloured else mi.Float
+        angular = [kind(0) for _ in range(order * (order + 2))]
         others = Media.around(self._medium).without(self._medium)
         shares, k = self._solid_angle.shares(p), mi.UInt32(0)
         while dr.hint(k < count, label="points on an emitter"):
@@ -435,9 +445,10 @@ class AreaLight(DirectLight):
             odd += dr.select(is_odd, passed, 0)
             odd_total += dr.select(is_odd, weight, 0)
             if dr.hint(order > 0, mode="scalar"):
-                angular = _with_harmonics(
-                    angular, direction, dr.select(seen, dr.mean(passed * past), 0), order
-                )
+                share = passed * past
+                if dr.hint(not coloured, mode="scalar"):
+                    share = dr.mean(share)
+                angular = _with_harmonics(angular, direction, dr.select(seen, share, 0), order)
             k += 1
         return transmitted, visible, total, odd, odd_total, angular
 
@@ -506,7 +517,8 @@ def area_lights_of(
     ]
     lights.sort(key=_power, reverse=True)
     order = order_of_direct_light(medium.phase)
-    values = (VALUES + order * (order + 2)) * dr.width(voxels)
+    channels = max(m.sigma_t.channels for m in (medium, *medium.others))
+    values = (VALUES + channels * order * (order + 2)) * dr.width(voxels)
     count = min(MOST_LIGHTS, MOST_VALUES // values)
     return [AreaLight(scene, e, medium, grid, voxels, classes, samples) for e in lights[:count]]
 
@@ -517,7 +529,7 @@ def _mean_and_bias(
     weight: mi.Float,
     odd: mi.Spectrum,
     odd_weight: mi.Float,
-    angular: list[mi.Float],
+    angular: list[mi.Float | mi.Spectrum],
 ) -> tuple[mi.Spectrum, mi.Spectrum]:
     """Return the mean transmittance T from the results of `AreaLight._sums`, and the bias of
     -log(T).
@@ -536,22 +548,44 @@ def moments_of(
 ) -> AngularField | None:
     """Create the field of the moments of the radiance from all ``lights`` with extent, relative to
     their irradiance at the ``voxels``; return None without such lights.
+
+    The field has one channel if all irradiances have the same colour.
     """
     lights = [light for light in lights if not light.has_one_direction]
     if not lights:
         return None
-    rows = [mi.Float(0)] * (1 + basis.order * (basis.order + 2))
-    for light in lights:
-        irradiance = dr.mean(light.irradiance)
-        means = [mi.Float(1), *light.angular_means()]
-        rows = [dr.fma(irradiance, y, total) for y, total in zip(means, rows, strict=True)]
-    phi, *moments = (spread(grid, voxels, [values], None) for values in rows)
-    return AngularField(basis, grid, [phi], moments)
+    means = [[mi.Spectrum(1), *light.angular_means()] for light in lights]
+    irradiances = [light.irradiance for light in lights]
+    if _have_same_colour(irradiances):
+        irradiances = [mi.Spectrum(dr.mean(irradiance)) for irradiance in irradiances]
+        channels = 1
+    else:
+        channels = dr.size_v(mi.Spectrum)
+    rows = []
+    for own in zip(*means, strict=True):
+        total = sum(e * mean for e, mean in zip(irradiances, own, strict=True))
+        rows += [spread(grid, voxels, [total[c]], None) for c in range(channels)]
+    return AngularField(basis, grid, rows[:channels], rows[channels:])
+
+
+def _have_same_colour(irradiances: list[mi.Spectrum]) -> bool:
+    """Return whether the channels of all ``irradiances`` have the same ratios everywhere."""
+    colour, largest = sum(irradiances[0]), mi.Float(0)
+    colour = [dr.sum(channel) / dr.sum(colour) for channel in irradiances[0]]
+    for irradiance in irradiances:
+        total = sum(irradiance)
+        for share, channel in zip(colour, irradiance, strict=True):
+            difference = dr.abs(channel - share * total)
+            largest = dr.maximum(largest, dr.select(total > 0, difference / total, 0))
+    return bool(dr.max(largest)[0] < SAME_COLOUR)
 
 
 def _with_harmonics(
-    sums: list[mi.Float], direction: mi.Vector3f, weight: mi.Float, order: int
-) -> list[mi.Float]:
+    sums: list[mi.Float | mi.Spectrum],
+    direction: mi.Vector3f,
+    weight: mi.Float | mi.Spectrum,
+    order: int,
+) -> list[mi.Float | mi.Spectrum]:
     """Return ``sums`` plus the spherical harmonics of ``direction``, degrees 1 to ``order``, times
     ``weight``.
     """

@@ -168,11 +168,11 @@ class DirectLight:
         _, near, far = self._line(p)
         return dr.maximum(far - near, 0)
 
-    def angular_means(self) -> list[mi.Float]:
+    def angular_means(self) -> list[mi.Spectrum]:
         """Return the mean spherical harmonics of the directions to the emitter, weighted by its
         irradiance at the voxels, from degree 1 on: ``order`` (order + 2) values.
         """
-        return list(dr.sh_eval(self.towards(self._centres), self.order))[1:]
+        return [mi.Spectrum(y) for y in dr.sh_eval(self.towards(self._centres), self.order)[1:]]
 
     def towards(self, p: mi.Point3f) -> mi.Vector3f:
         """Return the direction from world positions to an emitter without extent."""

@@ -8,7 +8,7 @@ import pytest
 
 from mitsuba_irrcache.errors import CacheFileError
 from mitsuba_irrcache.solvers.discrete_ordinates import solver
-from tests.support.surfaces import check, diffuse, fog, ground, images, lamp
+from tests.support.surfaces import bound, check, diffuse, fog, ground, images, lamp
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -105,6 +105,26 @@ def test_with_surfaces(scenes, build, depth, bounds):
     """``sweep`` agrees with volpath if the ground and another medium scatter radiance back."""
     depths, ours = {"max_depth": depth, "rr_depth": 50}, {"cache_spp": 128, "solver": "sweep"}
     check(*images(scenes, build(scenes), ours, depths, (64, 512)), **bounds)
+
+
+@pytest.mark.parametrize("extinction", [(1.0, 1.0, 1.0), (0.4, 1.5, 3.0)])
+def test_lamps_of_two_colours_add_up(extinction):
+    """The image under two lamps, each of a colour of its own, is the sum of those under one."""
+    medium = fog(extinction) | {"phase": hg(0.5)}
+    lamps = {
+        "red": lamp((0, 0.3, -3), (0, 0, 0), 1, (12, 1, 0.1)),
+        "blue": lamp((0, 0.3, 3), (0, 0, 0), 1, (0.1, 1, 12)),
+    }
+    place = mi.ScalarTransform4f().look_at([6, 0, -2.5], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}}
+    camera = {"type": "perspective", "fov": 26, "to_world": place, "film": film}
+    ours = {"type": "irrcache", "max_depth": 2, "resolution": 16, "cache_spp": 32}
+    objects = {"type": "scene", "sensor": camera, "integrator": ours, "box": bound(interior=medium)}
+    both, *single = (
+        np.array(mi.render(mi.load_dict(objects | chosen), spp=16))
+        for chosen in (lamps, *({name: one} for name, one in lamps.items()))
+    )
+    np.testing.assert_allclose(both, sum(single), rtol=0.02, atol=0.03 * both.mean())
 
 
 def test_furnace_with_surfaces(scenes):

@@ -135,7 +135,8 @@ class AnisotropicSweep(Sweep):
             light = self._closed_form_lights.get(id(irradiance))
             if light is not None:
                 value = light.means[channel]
-                higher = (value * mean for mean in light.angular_means()[: count - 1])
+                means = light.angular_means()[: count - 1]
+                higher = (value * mean[channel] for mean in means)
                 found.append(concatenated([value, *higher]))
                 continue
             value = irradiance[channel] * self._inverse_square_mean
