@@ -256,7 +256,7 @@ class TracedCameraRays:
         hide_emitters: bool,
     ) -> None:
         self.media, self.projections = description.media, projections
-        self.brightest = description.brightest
+        self.background_bound = description.background_bound
         #: the projection with most channels: media without a cache have no error estimates
         self.projection = max(projections, key=lambda p: p.channel_count)
         self.hide_emitters = hide_emitters
@@ -288,7 +288,7 @@ class TracedCameraRays:
             self._surfaces = earlier._surfaces.renewed(self._paths(earlier._surfaces.nodes))
 
     def _paths(self, nodes: SurfaceNodes | None = None) -> SurfacePaths:
-        rest = self.brightest, self.rr_depth, nodes, self._refracts
+        rest = self.background_bound, self.rr_depth, nodes, self._refracts
         return SurfacePaths(self.media, self.projections, self._emitters, *rest)
 
     def prepare_view(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int = 0) -> None:
@@ -409,7 +409,7 @@ class TracedCameraRays:
         self, state: _StraightRay, ray: mi.Ray3f, far: mi.Float, offset: mi.Float
     ) -> None:
         """Ray march the media between the last surface and the distance ``far`` of the next one."""
-        shows_emitters, max_background = self.max_depth > 0, mi.Spectrum(self.brightest)
+        shows_emitters, max_background = self.max_depth > 0, mi.Spectrum(self.background_bound)
         for projection in self.projections:
             hit, entry, leave = projection.medium.intersect(ray)
             entry, leave = dr.maximum(entry, state.near), dr.minimum(leave, far)

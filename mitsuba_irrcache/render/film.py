@@ -287,6 +287,8 @@ class PixelPositions:
         self.seed = seed if given else dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self.first = dr.opaque(mi.UInt32, 0)
         self._sequence, self._count = AntitheticPairs(count), Divisor(count)
+        #: whether a pixel has one sample, at its centre: such an image has no noise
+        self._is_single = dr.opaque(mi.Bool, count == 1)
 
     def next(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
         """Return the position in [0, 1)^2 of a ``sample`` of this pass."""
@@ -294,8 +296,9 @@ class PixelPositions:
             return self.sampler.next_2d()
         part, number = self._count.split(self.first + sample)
         shifts = mi.sample_tea_32(pixel ^ part * PART, self.seed, 8)
-        words, _, is_paired = self._sequence.words(number, shifts)
-        return mi.Point2f(unit_floats([dr.select(is_paired, word, 1 << 31) for word in words]))
+        words, *_ = self._sequence.words(number, shifts)
+        centre = mi.UInt32(1 << 31)
+        return mi.Point2f(unit_floats([dr.select(self._is_single, centre, w) for w in words]))
 
     def emitter_sample(self, pixel: mi.UInt32, sample: mi.UInt32) -> EmitterSample:
         """Return the position on emitters for a ``sample`` of this pass."""

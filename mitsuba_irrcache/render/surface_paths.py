@@ -75,7 +75,7 @@ class SurfacePaths:
         media: Media,
         projections: Sequence[Projection],
         emitters: SampledEmitters,
-        brightest: mi.Float,
+        background_bound: mi.Float,
         rr_depth: mi.UInt32,
         nodes: SurfaceNodes | None = None,
         splits: bool = False,
@@ -83,7 +83,7 @@ class SurfacePaths:
         """Use these ``nodes``, or none yet; ``splits``: split camera paths at glass."""
         self.splits = splits
         self.media, self.projections, self.emitters = media, projections, emitters
-        self.brightest, self.rr_depth = brightest, rr_depth
+        self.background_bound, self.rr_depth = background_bound, rr_depth
         if nodes is None:
             corners = [(p.medium.frame @ UNIT_CUBE)[:3] for p in projections]
             nodes = SurfaceNodes(np.min(corners, axis=(0, 2)), np.max(corners, axis=(0, 2)))
@@ -219,7 +219,7 @@ class SurfacePaths:
                 hit, entry, leave = projection.medium.intersect(ray)
                 entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
                 hit &= active & (pointer == projection.medium.pointer)
-                ends = ray, entry, leave, mi.Spectrum(self.brightest), offset, hit
+                ends = ray, entry, leave, mi.Spectrum(self.background_bound), offset, hit
                 peaked = projection.truncates_peak
                 part = Scattering.PEAK if peaked else Scattering.WITHOUT_PEAK
                 scattered, transmittance, *_ = projection.march(*ends, scattering=part)
@@ -432,7 +432,7 @@ class _PathFollower:
                 path.ray,
                 entry,
                 leave,
-                mi.Spectrum(self._paths.brightest),
+                mi.Spectrum(self._paths.background_bound),
                 offset,
                 hit,
                 scattering=Scattering.WITHOUT_PEAK if self._from_node else Scattering.ALL,

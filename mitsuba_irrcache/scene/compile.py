@@ -19,6 +19,8 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import Boundary, boundary_of, rays_through
 from mitsuba_irrcache.lights.emitters import (
+    POINT_LIKE,
+    EmitterKind,
     EmittersByKind,
     check_placement,
     illuminating,
@@ -57,6 +59,9 @@ COINCIDENCE_POINTS, COINCIDENT, COINCIDENT_SHARE = 256, 1e-5, 0.1
 #: Relative difference of the cosines of face normals and interpolated normals of an emissive mesh,
 #: averaged over its area, above which a warning is logged.
 MOST_LOST = 0.02
+#: Number of samples by which the radiance behind media is bounded, and kinds of emitters that are
+#: seen by reflection only.
+BOUND_SAMPLES, REFLECTED = 4096, (EmitterKind.SUN, *POINT_LIKE)
 #: Shapes with flat parts, besides meshes; others, such as instances, need not sample positions.
 FLAT = ("Rectangle", "Disk")
 #: Minimum number of distinct single-precision coordinates within a side of a medium, and within a
@@ -98,12 +103,13 @@ def compile_scene(
         grids = visible = (bake(medium, boundary).replaced(emission=emission, context=context),)
         if emission is not None:
             check_emission_is_within(emission, [grids[0].frame])
-        brightest = None
+        brightest = bound = None
     else:
         if not is_isolated:
             _check_general(scene, media)
         unscaled, names, reason = _baked(scene, media, emission, is_isolated, max_depth)
         brightest = dr.opaque(mi.Float, _brightest(scene))
+        bound = dr.opaque(mi.Float, _background_bound(scene, float(brightest[0])))
         if emission is not None:
             check_emission_is_within(emission, [grid.frame for grid in unscaled])
         grids = tuple(_among_others(unscaled, number, names) for number in range(len(unscaled)))
@@ -115,7 +121,8 @@ def compile_scene(
     for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
-    return SceneDescription(Media(grids), visible, emitters, brightest, _has_surfaces(scene))
+    has_surfaces = _has_surfaces(scene)
+    return SceneDescription(Media(grids), visible, emitters, brightest, bound, has_surfaces)
 
 
 def _detail(scene: mi.Scene, emission: Emission | None, max_depth: int) -> Detail:
@@ -510,6 +517,30 @@ def _brightest(scene: mi.Scene) -> float:
         value = mi.Spectrum(emitter.eval(si))
         found.append(float(np.nanmax(np.array(value))))
     return max(f for f in found if np.isfinite(f))
+
+
+def _background_bound(scene: mi.Scene, brightest: float) -> float:
+    """Estimate an upper bound of the radiance behind media: ``brightest``, that of the environment
+    in the directions that Mitsuba samples from it, which find a small sun, and what surfaces may
+    reflect of suns and point-like emitters.
+    """
+    rng, count = mi.PCG32(BOUND_SAMPLES), BOUND_SAMPLES
+    sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+    place = mi.Vector3f(*(rng.next_float32() for _ in range(3)))
+    ends = np.array([scene.bbox().min, scene.bbox().max], dtype=np.float64)
+    low, high = ends if np.isfinite(ends).all() else (np.zeros(3), np.ones(3))
+    vertex = dr.zeros(mi.Interaction3f, count)
+    vertex.p = mi.Point3f(*map(float, low)) + place * mi.Vector3f(*map(float, high - low))
+    found = [brightest]
+    for emitter in scene.emitters():
+        kind = kind_of(emitter)
+        if kind.is_environment or (kind in REFLECTED and _has_surfaces(scene)):
+            record, value = emitter.sample_direction(vertex, sample)
+            # The weight of a direction is the radiance over its density, or an irradiance.
+            value *= record.pdf if kind.is_environment else 1
+            largest = np.nanmax(np.where(np.isfinite(np.array(value)), np.array(value), 0))
+            found.append(float(largest))
+    return max(found)
 
 
 def _refuse(reason: str, hint: str = "") -> None:

@@ -22,6 +22,8 @@ class SceneDescription:
         emitters: the emitters by their kind.
         brightest: estimated maximum radiance of all emitters; None if rays are not traced, see
             `MediumGrid.is_traced`.
+        background_bound: estimated maximum radiance behind the media, of emitters or reflected by
+            surfaces; None if rays are not traced. Rays end where what remains of it is negligible.
         has_surfaces: whether any shape is more than the boundary of a medium.
     """
 
@@ -29,6 +31,7 @@ class SceneDescription:
     visible: tuple[MediumGrid, ...]
     emitters: EmittersByKind
     brightest: mi.Float | None = None
+    background_bound: mi.Float | None = None
     has_surfaces: bool = False
 
     @property

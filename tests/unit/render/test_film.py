@@ -151,7 +151,7 @@ def positions(spp: int, seed: int = 3, pixels: int = 4096) -> np.ndarray:
 
 @pytest.mark.parametrize("spp", [1, 2, 5, 16])
 def test_samples_mirror_each_other(rgb, spp):
-    """Samples are in pairs that are mirrored at the pixel centre; the last odd one lies there."""
+    """Samples are in pairs that are mirrored at the pixel centre; a single one lies there."""
     found = positions(spp)
     paired = spp - spp % 2
     np.testing.assert_allclose(found[0:paired:2] + found[1:paired:2], 1, atol=2e-7)
@@ -168,6 +168,13 @@ def test_each_sample_of_a_pair_is_uniform(rgb):
         assert np.abs(sample.mean(axis=0) - 1 / 2).max() < 4 * np.sqrt(1 / 12 / 4096)
         assert np.abs((sample**2).mean(axis=0) - 1 / 3).max() < 4 * np.sqrt(4 / 45 / 4096)
     assert np.abs(positions(2, seed=3) - positions(2, seed=4)).mean() > 0.2
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_all_samples_of_a_pixel_are_uniformly_distributed(count):
+    """So is the last one of an odd number: at the centre, it would bias the mean over seeds."""
+    for sample in positions(count):
+        assert np.abs((sample**2).mean(axis=0) - 1 / 3).max() < 4 * np.sqrt(4 / 45 / 4096)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 16, 37, 64])

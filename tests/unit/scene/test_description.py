@@ -44,6 +44,22 @@ def test_several_media(scenes, max_depth, visible):
     assert float(description.brightest[0]) > 0
 
 
+def test_the_radiance_behind_media_is_bounded(scenes):
+    """The bound includes a sun of one texel, and walls next to a point light: rays that end where
+    what remains is negligible must not let such radiance pass through opaque media.
+    """
+    texels = np.ones((128, 256, 3), dtype=np.float32)
+    texels[40, 30] = 1e5
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(texels)}
+    shape = scenes.boundary(scenes.medium(1.0, 0.5))
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3])}
+    point = {"type": "point", "position": [0, 0, 2.9], "intensity": 10.0}
+    for emitter, least in ((sky, 0.9e5), (point, 100)):
+        objects = {"emitter": emitter, "sun": None, "wall": wall}
+        description = compile_scene(scenes.load({"type": "volpath"}, shape, **objects))
+        assert float(description.background_bound[0]) > least
+
+
 def test_isolated_medium(scenes):
     scene = scenes.load({"type": "volpath"}, scenes.boundary(scenes.medium(1.0, 0.5)))
     emission = bake_emission(0.25, 2.0)
