@@ -89,16 +89,12 @@ def reference(
     a different file. ``advance`` is called with (samples, seconds).
     """
     scene_file = Path(scene_file)
+    require_emission(scene_file, parameters, integrator)
     folder.mkdir(parents=True, exist_ok=True)
     path = reference_path(scene_file, parameters, integrator, sensor, folder)
     found = Reference.load(path) if path.exists() else None
     if found is not None and found.spp >= spp and found.seconds >= seconds:
         return found
-    if loses_emission(scene_file, parameters, integrator):
-        raise IrrcacheError(
-            f'the media of "{scene_file}" emit, but the reference "{integrator}" would be without '
-            "emission: a comparison needs another --reference, or emission_scale 0 in the scene."
-        )
     scene = load_scene(scene_file, parameters, integrator)
     saved = time.perf_counter()
     with tqdm(
@@ -116,6 +112,15 @@ def reference(
                 saved = time.perf_counter()
     found.save(path)
     return found
+
+
+def require_emission(scene_file: Path, parameters: dict[str, str], integrator: str) -> None:
+    """Raise IrrcacheError if a reference of the scene would lack the emission of its media."""
+    if loses_emission(scene_file, parameters, integrator):
+        raise IrrcacheError(
+            f'the media of "{scene_file}" emit, but the reference "{integrator}" would be without '
+            "emission: a comparison needs another --reference, or emission_scale 0 in the scene."
+        )
 
 
 def render_halves(scene: mi.Scene, sensor: int, first: int, spp: int) -> Reference:

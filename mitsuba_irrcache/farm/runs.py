@@ -13,7 +13,11 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cli.render import chosen_integrator, terminated_like_interrupted
 from mitsuba_irrcache.compare.command import budgets_of, common_job, integrators_of
-from mitsuba_irrcache.compare.reference import default_folder, reference_path
+from mitsuba_irrcache.compare.reference import (
+    default_folder,
+    reference_path,
+    require_emission,
+)
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.cache import CacheRun
 from mitsuba_irrcache.farm.cluster import MOST_WORKERS, ClusterOptions, connected
@@ -179,6 +183,7 @@ def _check_parent(file: Path) -> None:
 def _reference(
     args: argparse.Namespace, scene: Path, parameters: dict[str, str], environment: Environment
 ) -> ReferenceRun:
+    require_emission(scene, parameters, args.reference)
     arguments = scene_arguments(scene, parameters, args.reference)
     available = len(load_scene(scene, parameters, args.reference).sensors())
     if args.sensor >= available:

@@ -8,6 +8,7 @@ from time import perf_counter
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.imaging.options import Options
 from mitsuba_irrcache.render.aovs import AOVS, Layers
 from mitsuba_irrcache.render.camera import CameraRays, TracedCameraRays
@@ -64,6 +65,12 @@ class ImageRenderer:
         """Render the film of ``sensor``."""
         medium = sensor.get_medium()
         check_sensor(scene, sensor)  # the sensor may have moved, or may not belong to the scene
+        if medium is not None and not camera_rays.shows(medium):
+            raise UnsupportedSceneError(
+                f'irrcache: sensor "{sensor.id()}" is in medium "{medium.id()}", which is rendered '
+                "for none of the sensors of the scene and has no cache. Add the sensor to the "
+                'scene, or render this image with "volpath".'
+            )
 
         def radiance(sampler, ray, weight, active) -> tuple:
             found = self.sample(camera_rays, scene, sampler, ray, medium, weight, active)

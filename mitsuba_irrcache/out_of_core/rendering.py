@@ -257,8 +257,9 @@ def _placement(medium: MediumGrid) -> np.ndarray:
         return axis_aligned(lower, upper)
     frame = medium.sigma_t.grid.to_world
     own = frame[:3, :3] @ ends + frame[:3, 3:]
-    difference = max(np.abs(own.min(axis=1) - lower).max(), np.abs(own.max(axis=1) - upper).max())
-    if difference > 1e-5 * (upper - lower).max():
+    # Axes may be mirrored or exchanged: each corner is one of the other box.
+    distances = np.linalg.norm(own[:, :, None] - corners[:, None, :], axis=0)
+    if distances.min(axis=1).max() > 1e-5 * (upper - lower).max():
         _refuse(f'the grid of medium "{medium.name}" is not its box')
     return frame
 

@@ -148,6 +148,10 @@ class ClosedFormCameraRays:
         self._half_space = half_space
         self.hide_emitters, self.shows_emitters = hide_emitters, max_depth != 0
 
+    def shows(self, medium: mi.Medium) -> bool:
+        """Return whether rays may start in ``medium``: there is only one."""
+        return True
+
     def sample(
         self,
         scene: mi.Scene,
@@ -281,6 +285,10 @@ class TracedCameraRays:
         self._refracts = description.refracts
         #: whether the current image uses irradiance on surfaces
         self.caches_surfaces = False
+
+    def shows(self, medium: mi.Medium) -> bool:
+        """Return whether rays may start in ``medium``: whether it is ray marched."""
+        return any(dr.all(p.medium.pointer == mi.MediumPtr(medium)) for p in self.projections)
 
     def adopt(self, earlier: TracedCameraRays) -> None:
         """Reuse the surface nodes of camera rays for an ``earlier`` state of the same caches."""

@@ -299,3 +299,17 @@ def test_sweep_is_refused_with_surfaces(scenes):
     scene = loaded(scenes, scene_ball(scenes, None), solver="sweep")
     with pytest.raises(IrrcacheError, match=r"sweep.*path.*auto"):
         scene.integrator().prepare(scene)
+
+
+def test_sensors_in_media_that_are_not_rendered_are_refused(scenes):
+    """A sensor that is not in the scene may start in a medium that no other sensor sees: rendered
+    without that medium, its image would be too bright.
+    """
+    glass = {"bsdf": {"type": "dielectric"}, "interior": fog()}
+    objects = {"box": bound(interior=fog()), "glass": ball((4, 0, 0), 1.0, **glass)}
+    scene = scenes.load({"type": "irrcache", "solver": "auto", "max_depth": 2}, None, **objects)
+    medium = next(s for s in scene.shapes() if s.class_name() == "Sphere").interior_medium()
+    place = mi.ScalarTransform4f().look_at([4, 0, 0], [4, 0, 1], [0, 1, 0])
+    sensor = mi.load_dict({"type": "perspective", "to_world": place, "medium": medium})
+    with pytest.raises(RuntimeError, match="is rendered for none of the sensors"):
+        mi.render(scene, sensor=sensor, spp=1)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.compare.reference import CHUNK, Reference, reference
+from mitsuba_irrcache.compare.reference import CHUNK, Reference, reference, reference_path
 from mitsuba_irrcache.compare.scene_files import scene_files
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.farm import runs
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -170,3 +173,12 @@ def test_references_without_the_emission_of_media_are_refused(scene, tmp_path):
     with pytest.raises(IrrcacheError, match="would be without emission"):
         reference(scene, {}, "volpath", tmp_path / "references", spp=1)
     assert reference(scene, {"emission": "0"}, "volpath", tmp_path / "references", spp=1).spp >= 1
+    # A file that another program has left is not returned either.
+    folder = tmp_path / "references"
+    empty = reference(scene, {"emission": "0"}, "volpath", folder, spp=1)
+    empty.save(reference_path(scene, {}, "volpath", 0, folder))
+    with pytest.raises(IrrcacheError, match="would be without emission"):
+        reference(scene, {}, "volpath", folder, spp=1)
+    farm = argparse.Namespace(reference="volpath", sensor=0, references=folder, reference_spp=4)
+    with pytest.raises(IrrcacheError, match="would be without emission"):
+        runs._reference(farm, scene, {}, None)

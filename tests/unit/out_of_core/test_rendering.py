@@ -216,6 +216,19 @@ def test_what_is_not_supported_is_refused_by_name(density, tmp_path, interior, o
         image(scene_of(tmp_path, medium(1.0, 0.9, PLACE) | interior, **objects), spp=1)
 
 
+def test_a_grid_that_is_turned_in_its_box_is_refused(density, tmp_path):
+    """Both have the same extent along the axes."""
+    turned = np.array([[1, 0, -1, 0], [0, 1, 0, -0.5], [1, 0, 1, -1], [0, 0, 0, 1.0]])
+    upright = np.diag([2.0, 1.0, 2.0, 1.0])
+    upright[:3, 3] = -1, -0.5, -1
+    coarse = np.ones((4, 4, 4), dtype=np.float32)
+    files = {"sigma_t_file": str(tmp_path / "density.npy"), "max_memory": "1GB"}
+    for grid, box in ((turned, upright), (upright, turned)):
+        scene = load(INTEGRATOR | files, boundary(medium(coarse, 0.9, grid), box))
+        with pytest.raises(RuntimeError, match="is not its box"):
+            image(scene, spp=1)
+
+
 def test_invalid_values_are_refused_with_their_place(density, tmp_path):
     density[30, 20, 10] = np.nan
     np.save(tmp_path / "density.npy", density)
