@@ -86,7 +86,8 @@ def findings(
             f"After {longest:g} s {ranked[0].integrator} has an RMSE of "
             f"{percent(errors[ranked[0]])} of the mean radiance{f'; {others}' if others else ''}."
         )
-    said += [_ratio(ranked[0], other, errors[other]) for other in ranked[1:]]
+    best = ranked[0] if ranked else None
+    said += [_ratio(best, errors[best], other, errors[other], longest) for other in ranked[1:]]
     if len(set(depths.values())) > 1:
         said.append(
             "Their images differ systematically, because max_depth differs: "
@@ -103,20 +104,24 @@ def findings(
     return said
 
 
-def _ratio(best: Curve, other: Curve, error: float) -> str:
-    if error - best.shown[-1] < 2 * np.hypot(uncertainty(best), uncertainty(other)):
+def _ratio(best: Curve, least: float, other: Curve, error: float, budget: float) -> str:
+    """Compare the errors ``least`` and ``error`` that two integrators have after ``budget`` s."""
+    reached = np.flatnonzero(np.isclose(other.shown, error, rtol=1e-9))
+    if reached.size:
+        budget = min(budget, float(other.seconds[reached[0]]))
+    if error - least < 2 * np.hypot(uncertainty(best), uncertainty(other)):
         return f"{other.integrator} is as good as {best.integrator} within the uncertainty."
     ours = time_to(best, error)
-    ratio = float(other.seconds[-1]) / ours.seconds
+    ratio = budget / ours.seconds
     if ours.how == "at most" and ratio < LEAST_RATIO:
         return (
             f"The first image of {best.integrator}, after {seconds(ours.seconds)} s, is better "
-            f"than {other.integrator}'s after {seconds(float(other.seconds[-1]))} s; a smaller "
-            "first budget tells how much faster it is."
+            f"than {other.integrator}'s after {seconds(budget)} s; a smaller first budget tells "
+            "how much faster it is."
         )
     at_least = "at least " if ours.how == "at most" else ""
     return (
-        f"The error that {other.integrator} has after {seconds(float(other.seconds[-1]))} s, "
+        f"The error that {other.integrator} has after {seconds(budget)} s, "
         f"{best.integrator} reaches in {_words(ours)}: {at_least}{ratio:.2g} times faster."
     )
 

@@ -21,6 +21,7 @@ from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
 from mitsuba_irrcache.render.surface_paths import SurfacePaths
 from mitsuba_irrcache.render.surface_vertices import facing, lambertian
+from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
 #: Number of rays by which a node measures the distances of its surroundings; by which a node that
@@ -115,13 +116,15 @@ class SurfaceIrradiance:
         self._groups += [group for group in groups if group[0] < group[1]]
 
     def _place(self, scene: mi.Scene, numbers: mi.UInt32, medium: mi.UInt32) -> tuple:
-        """Place new nodes on surfaces that have the ``medium`` in front of them.
+        """Place new nodes on surfaces. ``medium`` is the number of the one in front of the points
+        for which they are created, which other media may separate from the nodes.
 
         Returns the points that further rays from the nodes hit, and whether they hit any.
         """
         ray, length = self.nodes.rays(numbers)
         p, normals, valid = _first_surface(scene, ray, length)
-        dr.eval(p, normals, valid)
+        medium = self._medium_before(scene, p, normals[0], medium)
+        dr.eval(p, normals, valid, medium)
         count = dr.width(numbers)
         lane, k = Divisor(DISTANCE_RAYS).split(dr.arange(mi.UInt32, count * DISTANCE_RAYS))
         start, rng = self._ray_from(scene, p, normals, numbers, (lane, k), DISTANCE_RAYS)
@@ -135,6 +138,22 @@ class SurfaceIrradiance:
         clearance = dr.block_reduce(dr.ReduceOp.Min, surface, DISTANCE_RAYS)
         self.nodes.place(p, normals, distance, clearance, medium)
         return other, found
+
+    def _medium_before(
+        self, scene: mi.Scene, p: mi.Point3f, normal: mi.Normal3f, nearby: mi.UInt32
+    ) -> mi.UInt32:
+        """Return the number of the medium in front of surfaces at ``p``; ``nearby`` is that of a
+        point nearby, of which the extent may be known from its data only.
+        """
+        vertex = dr.zeros(mi.Interaction3f, dr.width(p))
+        vertex.p, vertex.n = p, normal
+        ray = vertex.spawn_ray(mi.Vector3f(normal))
+        found = self.paths.media.number_of(probe(scene, ray.o, ray.d))
+        for number, grid in enumerate(self.paths.media.grids, 1):
+            if not grid.has_exact_boundary:
+                unknown = (found == 0) & (nearby == number) & grid.contains(ray.o)
+                found = dr.select(unknown, number, found)
+        return found
 
     def _ray_from(
         self,

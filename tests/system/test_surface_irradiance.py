@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 from functools import partial
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -252,6 +253,25 @@ def test_shadow_of_a_medium_without_a_cache(scenes, sigma_t):
         for x in (rendered(sigma_t), rendered(np.full((32, 32, 32), 3.0)))
     )
     assert np.abs(found - expected).max() < 0.02 * expected.mean()
+
+
+def test_nodes_have_the_medium_of_their_own_place(scenes):
+    """Nodes on a floor that fog covers in part have the fog as their medium exactly where they lie
+    in it, whatever the medium in front of the points for which they are created.
+    """
+    floor = {"floor": ground(-0.5, diffuse(0.8, 0.8, 0.8))}
+    fog_box = {"box": bound(interior=fog((3.0, 3.0, 3.0), (0.2, 0.2, 0.2)))}
+    scene = scene_of(scenes, fog_box | floor | {"emitter": scenes.sky}, solver="sweep")
+    scenes.image(scene, spp=4)
+    nodes = nodes_of(scene)
+    number = dr.arange(mi.UInt32, nodes.count)
+    p, *_, distance = nodes.positions(number)
+    p, medium = np.array(p), np.array(nodes.medium_number(number))
+    known = np.array(distance) > 0
+    inside = np.abs(p).max(axis=0) < 1
+    apart = np.abs(np.abs(p[[0, 2]]).max(axis=0) - 1) > 1e-3
+    assert inside[known].any() and not inside[known].all()
+    np.testing.assert_array_equal((medium == 1)[known & apart], inside[known & apart])
 
 
 def test_edits_of_a_surface_are_seen(scenes):

@@ -305,9 +305,10 @@ def test_sensors_in_media_that_are_not_rendered_are_refused(scenes):
     """A sensor that is not in the scene may start in a medium that no other sensor sees: rendered
     without that medium, its image would be too bright.
     """
-    glass = {"bsdf": {"type": "dielectric"}, "interior": fog()}
+    glass = {"bsdf": {"type": "dielectric"}, "interior": fog((2.0, 2.0, 2.0))}
     objects = {"box": bound(interior=fog()), "glass": ball((4, 0, 0), 1.0, **glass)}
-    scene = scenes.load({"type": "irrcache", "solver": "auto", "max_depth": 2}, None, **objects)
+    ours = {"type": "irrcache", "solver": "sweep", "max_depth": 2, "resolution": 6}
+    scene = scenes.load(ours, None, **objects)
     medium = next(s for s in scene.shapes() if s.class_name() == "Sphere").interior_medium()
     place = mi.ScalarTransform4f().look_at([4, 0, 0], [4, 0, 1], [0, 1, 0])
     sensor = mi.load_dict({"type": "perspective", "to_world": place, "medium": medium})

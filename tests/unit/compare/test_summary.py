@@ -115,6 +115,15 @@ def test_a_first_image_that_is_better_states_no_ratio_of_one():
     """A lower bound of the ratio that is about 1 says nothing."""
     best = Curve("a", np.array([2.0]), np.array([0.005]), np.zeros(1))
     other = Curve("b", np.array([0.5, 2.0]), np.array([0.17, 0.08]), np.zeros(2))
-    assert "The first image of a, after 2 s, is better" in _ratio(best, other, 0.08)
+    assert "The first image of a, after 2 s, is better" in _ratio(best, 0.005, other, 0.08, 2.0)
     early = Curve("a", np.array([0.2]), np.array([0.005]), np.zeros(1))
-    assert _ratio(early, other, 0.08).endswith("at least 10 times faster.")
+    assert _ratio(early, 0.005, other, 0.08, 2.0).endswith("at least 10 times faster.")
+
+
+def test_ratios_are_those_at_the_budget_of_the_errors():
+    """The error after 3 s is not compared with the time of an image after 12 s."""
+    times = np.array([1.0, 3.0, 12.0])
+    best = Curve("a", times, 0.05 / np.sqrt(times), np.zeros(3))
+    other = Curve("b", times, 0.1 / np.sqrt(times), np.zeros(3))
+    said = _ratio(best, best.errors[1], other, other.errors[1], 3.0)
+    assert "has after 3 s" in said and said.endswith("3 times faster.")
