@@ -17,7 +17,12 @@ import xarray
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.lengths import mass_density, metres, mixing_ratio
-from mitsuba_irrcache.volumes.netcdf_files import open_dataset, read_variable, spatial_axes
+from mitsuba_irrcache.volumes.netcdf_files import (
+    open_dataset,
+    read_variable,
+    spatial_axes,
+    values_at_levels,
+)
 from mitsuba_irrcache.volumes.options import CloudVariables, ReadOptions, chosen_field
 
 #: Density of water [kg/m^3].
@@ -61,24 +66,23 @@ def read_cloud(path: Path, options: ReadOptions, variables: CloudVariables) -> V
     with open_dataset(path) as dataset:
         options = replace(options, field=None)
         name = _found(path, dataset, variables.water, _WATER_NAMES, "liquid water content")
-        water = read_variable(path, dataset, name, options)
-        content = np.nan_to_num(water.values.astype(np.float64), nan=0.0)
+        content = np.nan_to_num(values_at_levels(path, dataset, name, options), nan=0.0)
         content *= _water_unit(path, dataset, name, options, variables)
         if content.min() < 0:
             raise IrrcacheError(
                 f"{path}[{name}] is negative, {content.min():.3g} kg/m^3 at least; clip it at 0"
             )
         radius = _radius(path, dataset, options, variables, content > 0)
-    length = metres(water.length_unit)
+        sigma_t = np.where(content > 0, 1.5 * content / (WATER * radius), 0.0)
+        found = read_variable(path, dataset, name, options, lambda _: sigma_t.astype(np.float32))
+    length = metres(found.length_unit)
     if length is None:
         raise IrrcacheError(
             f"{path}: the coordinates of {name!r} have no unit of length, which the extinction "
             "refers to; add the attribute units (m or km) to them"
         )
-    sigma_t = np.where(content > 0, 1.5 * content / (WATER * radius), 0.0) * length
-    return replace(
-        water, values=sigma_t.astype(np.float32), unit=f"1/{water.length_unit}", source=str(path)
-    )
+    values = (found.values * length).astype(np.float32)
+    return replace(found, values=values, unit=f"1/{found.length_unit}", source=str(path))
 
 
 def _found(
@@ -124,8 +128,8 @@ def _water_unit(
         if candidate in dataset.data_vars and dataset[candidate].dims == dataset[name].dims:
             density = mass_density(str(dataset[candidate].attrs.get("units", "")))
             if density is not None:
-                air = read_variable(path, dataset, candidate, options)
-                return ratio * density * air.values.astype(np.float64)
+                air = values_at_levels(path, dataset, candidate, options)
+                return ratio * density * air
     raise IrrcacheError(
         f"{path}[{name}] is a mixing ratio ({unit}), and the file has no density of air; give "
         "--air-density KG_PER_M3, about 1.1 in low clouds"
@@ -151,7 +155,7 @@ def _radius(
         raise IrrcacheError(
             f"{path}[{name}] has the unit {unit!r}; give it the attribute units, um"
         )
-    radius = read_variable(path, dataset, name, options).values.astype(np.float64) * factor
+    radius = values_at_levels(path, dataset, name, options) * factor
     if radius.shape != has_water.shape:
         raise IrrcacheError(
             f"{path}[{name}] has shape {radius.shape}, but the water {has_water.shape}; "

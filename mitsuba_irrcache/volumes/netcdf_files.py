@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,9 +116,17 @@ def open_dataset(path: Path) -> xarray.Dataset:
 
 
 def read_variable(
-    path: Path, dataset: xarray.Dataset, name: str, options: ReadOptions
+    path: Path,
+    dataset: xarray.Dataset,
+    name: str,
+    options: ReadOptions,
+    derive: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> VolumeData:
-    """Read one variable with its placement; see `read`."""
+    """Read one variable with its placement; see `read`.
+
+    ``derive`` computes other values from it, at the file's own levels: products and quotients of
+    several variables are not those of interpolated ones.
+    """
     variable, source = dataset[name], f"{path}[{name}]"
     axes = spatial_axes(variable)
     letters = "".join(_letter(dimension, axes) for dimension in variable.dims)
@@ -136,6 +144,9 @@ def read_variable(
     for number, axis in enumerate("zyx"):
         if placed[axis].is_reversed:
             values = np.flip(values, number)
+    if derive is not None:
+        values = derive(values)
+    for number, axis in enumerate("zyx"):
         if not placed[axis].is_even:
             source += f" (levels along {axis} interpolated to even ones)"
             values = _interpolated(values, number, placed[axis])
@@ -147,6 +158,20 @@ def read_variable(
         length_unit=unit,
         source=source,
     )
+
+
+def values_at_levels(
+    path: Path, dataset: xarray.Dataset, name: str, options: ReadOptions
+) -> np.ndarray:
+    """Return the values (z, y, x) of one variable at the file's own levels, float64."""
+    found = []
+
+    def keep(values: np.ndarray) -> np.ndarray:
+        found.append(values.astype(np.float64))
+        return values
+
+    read_variable(path, dataset, name, options, keep)
+    return found[0]
 
 
 def _check_zarr(source: str, folder: Path, name: str) -> None:
@@ -198,7 +223,8 @@ def _placed(
 ) -> tuple[str, dict[str, _Axis]]:
     """Return the unit of length, and coordinates in it: the file's if it has one, or metres.
 
-    If they are ``ignored``, because the user states the spacing, the coordinates are indices.
+    Coordinates that increase downwards, such as depths, change their signs. If coordinates are
+    ``ignored``, because the user states the spacing, they are indices.
     """
     units, placed = {}, {}
     for dimension, axis in axes.items():
@@ -216,10 +242,19 @@ def _placed(
             positions = np.arange(variable.sizes[dimension], dtype=np.float64)
         else:
             factor = 1.0 if is_common or not units[axis] else metres(units[axis])
+            if _is_downwards(coordinate):
+                factor = -factor
             positions = np.asarray(coordinate.values, dtype=np.float64) * factor
         placed[axis] = _axis(source, dimension, positions)
     unit = units["x"] if is_common else "m"
     return ("" if ignored else unit), placed
+
+
+def _is_downwards(coordinate: xarray.DataArray) -> bool:
+    """Return whether a coordinate increases downwards (CF conventions)."""
+    positive = str(coordinate.attrs.get("positive", "")).lower()
+    is_depth = coordinate.attrs.get("standard_name", "") == "depth"
+    return positive == "down" or (is_depth and positive != "up")
 
 
 def _axis(source: str, dimension: Hashable, positions: np.ndarray) -> _Axis:

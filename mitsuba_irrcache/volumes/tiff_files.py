@@ -15,6 +15,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.extras import remedy
 from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.lengths import factors_to_first
 from mitsuba_irrcache.volumes.options import ReadOptions, chosen_field, readable_type, scalar_volume
 from mitsuba_irrcache.volumes.raw import check_numbering, natural_order
 
@@ -34,7 +35,8 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
             return _read_pages(path, tiff, options)
         names = [series.name or str(i) for i, series in enumerate(tiff.series)]
         name = chosen_field(str(path), dict.fromkeys(names), options.field, "series")
-        series = tiff.series[names.index(name)]
+        number = names.index(name)
+        series = tiff.series[number]
         readable_type(str(path), series.dtype)
         _check_segments(path, series)
         needed = int(np.prod(series.shape, dtype=object)) * series.dtype.itemsize
@@ -46,7 +48,7 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
                 "most channels and frames besides"
             )
         values = scalar_volume(str(path), _decoded(path, series), axes, options)
-        spacing, unit = _voxel_size(tiff)
+        spacing, unit = _voxel_size(path, tiff, number)
     return VolumeData(values, spacing, length_unit=unit, source=str(path))
 
 
@@ -66,7 +68,7 @@ def _read_pages(path: Path, tiff: tifffile.TiffFile, options: ReadOptions) -> Vo
         _check_segments(path, part)
     slices = np.stack([_decoded(path, part) for part in tiff.series])
     axes = "zyx" if slices.ndim == 3 else "zyxc"
-    spacing, unit = _voxel_size(tiff)
+    spacing, unit = _voxel_size(path, tiff)
     values = scalar_volume(str(path), slices, axes, options)
     return VolumeData(values, spacing, length_unit=unit, source=str(path))
 
@@ -169,18 +171,22 @@ def _decoded(path: Path, series: tifffile.TiffPageSeries) -> np.ndarray:
         ) from error
 
 
-def _voxel_size(tiff: tifffile.TiffFile) -> tuple[tuple[float, float, float], str]:
-    """Return the voxel size along x, y, z, and its unit; 1 where the file states none.
+def _voxel_size(
+    path: Path, tiff: tifffile.TiffFile, number: int = 0
+) -> tuple[tuple[float, float, float], str]:
+    """Return the voxel size along x, y, z of the series with this ``number``, and its unit; 1 where
+    the file states none.
 
     The resolution of plain TIFF files is that of a printer, and is ignored.
     """
     if tiff.ome_metadata:
-        pixels = next(
-            (e for e in ElementTree.fromstring(tiff.ome_metadata).iter() if _is_pixels(e)), None
-        )
+        images = [e for e in ElementTree.fromstring(tiff.ome_metadata).iter() if _is_pixels(e)]
+        pixels = images[number] if number < len(images) else None
         if pixels is not None and "PhysicalSizeX" in pixels.attrib:
             sizes = [float(pixels.get(f"PhysicalSize{axis}", 1.0)) for axis in "XYZ"]
-            return tuple(sizes), pixels.get("PhysicalSizeXUnit", "µm")
+            units = [pixels.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"]
+            factors = factors_to_first(str(path), units)
+            return tuple(s * f for s, f in zip(sizes, factors, strict=True)), units[0]
     if tiff.imagej_metadata is not None:
         tags = tiff.pages[0].tags
         sizes = [_edge(tags, "XResolution"), _edge(tags, "YResolution")]

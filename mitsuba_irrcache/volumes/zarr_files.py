@@ -12,6 +12,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.zarr_chunks import check_chunks
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.formats import ZARR_MARKS
+from mitsuba_irrcache.volumes.lengths import factors_to_first
 from mitsuba_irrcache.volumes.options import (
     ReadOptions,
     chosen_field,
@@ -103,10 +104,13 @@ def _read_ome(
         raise IrrcacheError(f"{source} is a group, not the array of a resolution; export it again")
     note = absent_chunks(source, path / group.path / level, array)
     values = scalar_volume(source, array, names, options)
+    places = [names.index(axis) for axis in "xyz"]
+    units = [axes[place].get("unit", "") for place in places]
+    factors = factors_to_first(source, units)
     return VolumeData(
         values,
-        tuple(scale[names.index(axis)] for axis in "xyz"),
-        tuple(shift[names.index(axis)] for axis in "xyz"),
-        length_unit=next((a["unit"] for a in axes if a["name"] == "x" and "unit" in a), ""),
+        tuple(scale[place] * factor for place, factor in zip(places, factors, strict=True)),
+        tuple(shift[place] * factor for place, factor in zip(places, factors, strict=True)),
+        length_unit=units[0],
         source=source + note,
     )

@@ -48,6 +48,25 @@ def test_extinction_is_that_of_the_formula(tmp_path, unit):
     assert (volume.unit, volume.length_unit, volume.spacing) == (f"1/{unit}", unit, (20, 20, 20))
 
 
+def test_extinction_is_interpolated_and_not_its_parts(tmp_path):
+    """Between uneven levels at the edge of a cloud, where the radius is 0 or missing outside."""
+    levels = np.array([0.0, 100.0, 200.0, 300.0, 500.0, 900.0])
+    water, radius = np.zeros((6, 2, 3)), np.zeros((6, 2, 3))
+    water[3:5], radius[3:5] = 1.0, 10.0
+    names = {"lwc": (water, "g m-3"), "reff": (np.where(radius > 0, radius, np.nan), "um")}
+    data = xarray.Dataset(
+        {name: (("z", "y", "x"), v, {"units": unit}) for name, (v, unit) in names.items()}
+    )
+    for axis in "zyx":
+        places = levels if axis == "z" else 100.0 * np.arange(data.sizes[axis])
+        data[axis] = (axis, places, {"units": "m"})
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    volume = read_volume(tmp_path / "a.nc", cloud=CloudVariables())
+    extinction = 3e-3 / (2 * 1000 * 10e-6)
+    column = volume.values[:, 0, 0].sum() * volume.spacing[2]
+    assert column == pytest.approx(extinction * (50 + 200 + 200), rel=1e-4)
+
+
 @pytest.mark.parametrize(
     ("water", "radius"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import zipfile
 from pathlib import Path
@@ -347,6 +348,18 @@ def test_netcdf_frame_and_mixed_units(tmp_path):
     assert volume.length_unit == "m"
 
 
+@pytest.mark.parametrize("attributes", [{"positive": "down"}, {"standard_name": "depth"}])
+def test_depths_point_downwards(tmp_path, attributes):
+    first, data = ReadOptions(frame=0), dataset()
+    plain = read_volume(written(tmp_path, data), options=first)
+    data["z"].attrs |= attributes
+    turned = read_volume(written(tmp_path, data), options=first)
+    np.testing.assert_array_equal(turned.values, plain.values[::-1])
+    assert turned.spacing == plain.spacing
+    top = plain.origin[2] + plain.spacing[2] * (len(plain.values) - 1)
+    assert turned.origin[2] == pytest.approx(-top)
+
+
 def test_uneven_levels_are_interpolated_linearly(tmp_path):
     """A field that is linear in the height stays the same function of the height."""
     heights = np.array([0.0, 10.0, 30.0, 70.0])
@@ -391,6 +404,39 @@ def test_packed_values_are_unpacked_and_missing_ones_located(tmp_path):
 
 
 # Zarr and HDF5
+
+
+def test_units_of_ome_zarr_may_differ_between_axes(tmp_path):
+    path = WRITTEN["ome-zarr 0.4"].make(tmp_path, ramp())
+    description = path / ".zattrs"
+    content = json.loads(description.read_text())
+    for axis in content["multiscales"][0]["axes"]:
+        if axis["name"] == "z":
+            axis["unit"] = "nanometer"
+    description.write_text(json.dumps(content))
+    volume = read_volume(path)
+    expected = (*SPACING[:2], SPACING[2] * 1e-3)
+    np.testing.assert_allclose(volume.spacing, expected)
+    for axis in content["multiscales"][0]["axes"]:
+        axis["unit"] = {"z": "foo"}.get(axis["name"], "micrometer")
+    description.write_text(json.dumps(content))
+    with pytest.raises(IrrcacheError, match=r"'foo' is no unit of length.*--spacing"):
+        read_volume(path)
+
+
+def test_each_series_of_a_tiff_file_has_its_own_voxel_size(tmp_path):
+    tifffile = pytest.importorskip("tifffile", reason="tifffile is not installed")
+    sizes = {"big": (0.1, 0.1, 500.0), "small": (2.0, 2.0, 7000.0)}
+    with tifffile.TiffWriter(tmp_path / "a.ome.tif", ome=True) as file:
+        for number, (name, size) in enumerate(sizes.items()):
+            placed = {f"PhysicalSize{a}": s for a, s in zip("XYZ", size, strict=True)}
+            units = {"PhysicalSizeZUnit": "nm"}
+            values = np.full((4 + number, 5, 6), number, dtype=np.uint8)
+            file.write(values, metadata={"axes": "ZYX", "Name": name} | placed | units)
+    for name, (x, y, z) in sizes.items():
+        volume = read_volume(tmp_path / "a.ome.tif", options=ReadOptions(field=name))
+        np.testing.assert_allclose(volume.spacing, (x, y, z * 1e-3))
+        assert volume.length_unit == "µm"
 
 
 def test_lower_resolution_of_ome_zarr_is_chosen(tmp_path):
