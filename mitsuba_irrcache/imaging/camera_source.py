@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from mitsuba_irrcache.out_of_core.rendering import MappedMedium
 
 
+#: Revision that no builder has: camera rays are created anew.
+NO_REVISION = -1
+
+
 class CameraRaySource:
     """Creates the camera rays for a scene, and reuses them while its caches do not change.
 
@@ -104,13 +108,15 @@ class CameraRaySource:
                 "not guaranteed.",
             )
             return spp
-        before = self.certificate
+        before, is_step_new = self.certificate, found.step != self._step
         self._step, self.certificate = found.step, found.certificate
         self.builder.adopt(found.builder)
         rays = self._options.rays
         if found.camera_rays is not None and not (rays.layered or rays.with_error):
             self.latest, self._parts = found.camera_rays, self.builder.parts
             self._revision = self.builder.revision
+        elif is_step_new:
+            self._revision = NO_REVISION  # the same cache is ray marched with other steps
         if self.certificate is not before:
             exceeded = self.certificate.parts and not self.certificate.is_met
             level = mi.LogLevel.Warn if exceeded else mi.LogLevel.Info
