@@ -99,7 +99,8 @@ class CacheRun:
         with self._checkpoints.measured():
             for medium in self._media.values():
                 if medium.cache.samples > medium.saved_samples:
-                    medium.cache.save(medium.file)
+                    if not medium.is_ahead(medium.file):
+                        medium.cache.save(medium.file)
                     medium.saved_samples = medium.cache.samples
         for parts in self._parts.values():
             parts.forget()

@@ -143,12 +143,13 @@ class Dispatch:
             return
 
     def _wait_for_workers(self, now: float) -> None:
-        if self._workers:
+        if self._fit:
             self._seen = self._reminded = now
         elif now - self._seen > self._patience:
+            others = f" ({len(self._workers)} are excluded)" if self._workers else ""
             raise IrrcacheError(
-                f"no worker has started for {now - self._seen:.0f} s; {self._progress}. See "
-                "whether there is enough memory, and lower --workers."
+                f"no worker{others} has started for {now - self._seen:.0f} s; {self._progress}. "
+                "See whether there is enough memory, and lower --workers."
             )
         elif now - self._reminded > REMINDER:
             self._reminded = now

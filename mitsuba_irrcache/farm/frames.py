@@ -111,12 +111,13 @@ def frame_jobs(
     The scene of the first frame is loaded here, so that errors in it are found at once.
     """
     rows = rows_of(args.vary, args.table, scene.parent)
-    integrator = chosen_integrator(scene, parameters | rows[0], integrator)
-    loaded = load_scene(scene, parameters | rows[0], integrator)
+    chosen = chosen_integrator(scene, parameters | rows[0], integrator)
+    loaded = load_scene(scene, parameters | rows[0], chosen)
     sensors = sensors_of(args.sensors, len(loaded.sensors()))
     digits = max(4, len(str(len(rows) - 1)))
     for number, row in enumerate(rows):
-        arguments = scene_arguments(scene, parameters | row, integrator)
+        chosen = chosen_integrator(scene, parameters | row, integrator)
+        arguments = scene_arguments(scene, parameters | row, chosen)
         for sensor in sensors:
             name = f"frame-{number:0{digits}d}"
             name += f"-sensor-{sensor}" if len(sensors) > 1 else ""

@@ -36,6 +36,7 @@ from mitsuba_irrcache.io.scene_files import (
 )
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.memory import total_memory
+from mitsuba_irrcache.out_of_core.irradiance_file import check_replaceable
 from mitsuba_irrcache.out_of_core.rendering import memory_beside_python
 from mitsuba_irrcache.out_of_core.survey import MappedField
 
@@ -53,8 +54,9 @@ def run_cache(args: argparse.Namespace) -> int:
         return _fill_volume(args, options, environment, loaded)
     arguments = scene_arguments(scene, parameters, integrator)
     cache = CacheRun(arguments, loaded, environment, args.output, args.resume)
+    jobs = cache.begin()
     try:
-        status = _dispatch(options, cache.begin(), cache.store)
+        status = _dispatch(options, jobs, cache.store)
     finally:
         complete = cache.finish()
     if complete:
@@ -67,6 +69,7 @@ def _fill_volume(
 ) -> int:
     """Fill the irradiance of a medium whose extinction is in a file."""
     file, parts = args.output, args.output.with_name(f"{args.output.name}.parts")
+    check_replaceable(file)
     present = [path for path in (file, parts) if path.exists()]
     if present and not args.resume:
         raise IrrcacheError(

@@ -135,7 +135,10 @@ def _prepare(scene: mi.Scene) -> None:
     for medium in media:
         medium.cache.fingerprint = medium.fingerprint(scene)
     settings = [
-        (m.settings.seed, m.target(m.settings.samples), m.cache.batch, m.cache.fingerprint)
+        (
+            (m.settings.seed, m.settings.rr_depth, m.target(m.settings.samples)),
+            (m.cache.batch, m.cache.fingerprint),
+        )
         for m in media
     ]
     key = json.dumps(settings)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
 from mitsuba_irrcache.out_of_core.slabs import even_slabs
@@ -59,13 +60,36 @@ def write(path: Path, irradiance: BrickFile, colour: np.ndarray, inputs: str) ->
         file.write(json.dumps(record).encode())
 
 
+def check_replaceable(path: Path) -> None:
+    """Raise IrrcacheError if ``path`` is a file that `write` cannot have written, such as a volume:
+    it has no record, which an interruption may also cause, and holds no irradiance (z, y, x, c).
+    """
+    if not path.exists():
+        return
+    try:
+        if {"inputs", "is_grey", "file"} <= set(json.loads(_record(path).read_text())):
+            return
+    except (OSError, ValueError, TypeError):  # no record, or a damaged one
+        pass
+    try:
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+        if values.ndim == 4 and values.dtype == np.dtype("<f4"):
+            return
+    except (OSError, ValueError):
+        pass
+    raise IrrcacheError(
+        f'irrcache: "{path}" exists and is no irradiance written by irrcache: it is not replaced. '
+        "Name another file for the irradiance, or delete it."
+    )
+
+
 def recorded(path: Path, inputs: str) -> IrradianceFile | None:
     """Open the file if it was computed from these ``inputs`` and has not been changed since."""
     try:
         record = json.loads(_record(path).read_text())
         if record["inputs"] == inputs and record["file"] == _state(path):
             return IrradianceFile(path, record["is_grey"])
-    except (OSError, ValueError, KeyError):  # no file, or a damaged one
+    except (OSError, ValueError, KeyError, TypeError):  # no file, or a damaged one
         pass
     return None
 

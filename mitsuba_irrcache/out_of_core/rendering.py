@@ -20,7 +20,12 @@ from mitsuba_irrcache.machine.memory import available_memory
 from mitsuba_irrcache.machine.versions import DISTRIBUTION, installed_version
 from mitsuba_irrcache.media.medium import MediumGrid, axis_aligned
 from mitsuba_irrcache.out_of_core.brick_file import BrickFile
-from mitsuba_irrcache.out_of_core.irradiance_file import IrradianceFile, recorded, write
+from mitsuba_irrcache.out_of_core.irradiance_file import (
+    IrradianceFile,
+    check_replaceable,
+    recorded,
+    write,
+)
 from mitsuba_irrcache.out_of_core.scattering import ScatteredIrradiance, add
 from mitsuba_irrcache.out_of_core.slab_march import MappedIrradiance, SlabProjection
 from mitsuba_irrcache.out_of_core.slab_sweep import SlabSweep
@@ -137,6 +142,8 @@ class MappedMedium:
             self._irradiance = known, np.ones(1 if mi.is_monochromatic else 3)
             mi.Log(mi.LogLevel.Info, f'irrcache: the irradiance is read from "{files.irradiance}"')
             return
+        if files.irradiance:
+            check_replaceable(Path(files.irradiance))
         _log_start(grid, sigma_t)
         sweep = begin(sigma_t, inputs)
         if sweep.is_dense:

@@ -507,7 +507,7 @@ class CachedMedium:
             return
         try:
             with _SAVING:  # no other thread writes the file between check and writing
-                if not self._is_ahead(file):
+                if not self.is_ahead(file):
                     cache.save(file)
             self.saved_samples = cache.samples
         except IrrcacheError as error:
@@ -517,7 +517,7 @@ class CachedMedium:
                 "used nevertheless.",
             )
 
-    def _is_ahead(self, file: str) -> bool:
+    def is_ahead(self, file: str) -> bool:
         """Return whether another process has written at least as many samples of the same scene.
 
         Raises CacheFileError if the file now belongs to another scene.

@@ -78,6 +78,17 @@ def test_kills_of_workers_and_of_the_command_leave_no_trace(tmp_path):
     assert file.read_bytes() == (tmp_path / "alone.cache").read_bytes()
 
 
+def test_a_folder_of_other_files_is_refused_and_stays(tmp_path, capsys):
+    """The folder for waiting parts may exist for another purpose: it is not removed."""
+    notes = tmp_path / "light.cache.parts" / "notes.txt"
+    notes.parent.mkdir()
+    notes.write_text("precious")
+    command = ["farm", "cache", SCENE, "-o", str(tmp_path / "light.cache"), "-i"]
+    assert main([*command, "irrcache{resolution=6,cache_spp=32}"]) != 0
+    assert "holds no results" in capsys.readouterr().err
+    assert notes.read_text() == "precious"
+
+
 def test_frames_equal_images_that_are_rendered_one_by_one(tmp_path, capsys):
     integrator = "irrcache{solver=path,resolution=8,cache_spp=64}"
     frames = tmp_path / "frames"

@@ -75,6 +75,21 @@ def test_the_irradiance_is_written_to_a_file(density, tmp_path):
     np.testing.assert_allclose(np.load(file), expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["density.npy", "other.npy", "notes.npy"])
+def test_files_that_are_no_irradiance_are_not_replaced(density, tmp_path, name):
+    """The volume itself, another array, or a file of another kind."""
+    file = tmp_path / name
+    if name == "notes.npy":
+        file.write_text("precious")
+    elif name == "other.npy":
+        np.save(file, np.arange(5))
+    before = file.read_bytes()
+    scene = scene_of(tmp_path, medium(1.0, 0.9, PLACE), files={"irradiance_file": str(file)})
+    with pytest.raises(RuntimeError, match="is not replaced"):
+        image(scene, spp=1)
+    assert file.read_bytes() == before
+
+
 @pytest.mark.parametrize("sky", [[0.5, 0.5, 0.5], [0.2, 0.5, 0.9]])
 def test_an_irradiance_file_of_the_same_inputs_is_read(density, tmp_path, monkeypatch, sky):
     file = tmp_path / "irradiance.npy"
