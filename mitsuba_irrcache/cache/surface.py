@@ -45,6 +45,11 @@ TANGENT = 0.3
 #: Distance of another surface from a node, over the spacing, below which this surface may lie
 #: between nodes, as in corners and below objects.
 CLEARANCE = 1.5
+#: Extent of a shape over the coarsest spacing at its place below which its occlusion of indirect
+#: radiance may be missed: the rays from nodes around it, which finer levels depend on, rarely hit
+#: it. With 0.09, blocks of pixels around pebbles are 17 % of the image's mean too bright; with 0.2,
+#: 5 %; with 0.02, 11 to 30 %.
+SMALL_SHAPE = 0.15
 #: Offset of the lattices' origin, so that planes at round coordinates are not on the boundary of
 #: two intervals.
 SHIFT = np.array([0.2137, 0.3719, 0.4482])
@@ -103,6 +108,11 @@ class SurfaceNodes:
         self._places, self._normals = mi.Float([0.0] * 4), mi.Float([0.0] * 4)
         self._geometric = mi.Float([0.0] * 4)
         self._slots, self._mask = mi.UInt32([NONE, NONE]), dr.opaque(mi.UInt32, 1)
+
+    def coarsest_spacing(self, p: np.ndarray) -> float:
+        """Return the spacing of the coarsest lattice at a world position (3,) [scene units]."""
+        level = self._coarsest_level(mi.Point3f(*(float(x) for x in p)))
+        return float(self._spacing_at(level)[0])
 
     # Lookup
 

@@ -31,7 +31,7 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.film import CameraSampler, scattered_rays
 from mitsuba_irrcache.render.raymarch import CachedFields, Projection
 from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
-from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance
+from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance, warn_of_small_shapes
 from mitsuba_irrcache.render.surface_paths import SurfacePaths
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
@@ -312,6 +312,7 @@ class TracedCameraRays:
             return
         if self._surfaces is None:
             self._surfaces = SurfaceIrradiance(self._paths(), seed)
+            warn_of_small_shapes(scene, self._surfaces.paths.nodes)
         ray = scattered_rays(sensor, PLACEMENT_RAYS)
         medium = sensor.get_medium()
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)

@@ -15,14 +15,17 @@ from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.cache.angular import Source
+from mitsuba_irrcache.cache.surface import SMALL_SHAPE, SurfaceNodes
 from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
 from mitsuba_irrcache.render.surface_paths import SurfacePaths
 from mitsuba_irrcache.render.surface_vertices import facing, lambertian
+from mitsuba_irrcache.scene.consistency import described
 from mitsuba_irrcache.scene.medium_probe import probe
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null, is_surface
 
 #: Number of rays by which a node measures the distances of its surroundings; by which a node that
 #: camera rays need samples its irradiance; by which other nodes do.
@@ -334,3 +337,29 @@ def _first_surface(scene: mi.Scene, ray: mi.Ray3f, length: mi.Float):
         crossings += 1
         active &= crossings < MOST_CROSSINGS
     return position, (geometric, shading), found
+
+
+def warn_of_small_shapes(scene: mi.Scene, nodes: SurfaceNodes) -> None:
+    """Log a warning for surfaces that are small compared to the spacing of ``nodes`` around them,
+    whose occlusion of radiance from the sky and from other surfaces may be missed.
+    """
+    small = []
+    for shape in scene.shapes():
+        ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
+        if not is_surface(shape) or shape.is_emitter() or not np.isfinite(ends).all():
+            continue
+        extent = float((ends[1] - ends[0]).max())
+        spacing = nodes.coarsest_spacing(ends.mean(axis=0))
+        if 0 < extent < SMALL_SHAPE * spacing:
+            small.append((extent / spacing, shape, spacing))
+    if small:
+        _, shape, spacing = min(small, key=lambda each: each[0])
+        others = f" and {len(small) - 1} more" if len(small) > 1 else ""
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"irrcache: {described(shape)}{others} is small compared to the spacing of the nodes "
+            f"of irradiance on surfaces, {spacing:.2g} there, which follows from the size of the "
+            "media and the distance from them: floors and walls around it may be up to a third too "
+            "bright, since its occlusion of indirect radiance is missed. Render such views with "
+            '"volpath".',
+        )

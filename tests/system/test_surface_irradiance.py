@@ -274,6 +274,18 @@ def test_nodes_have_the_medium_of_their_own_place(scenes):
     np.testing.assert_array_equal((medium == 1)[known & apart], inside[known & apart])
 
 
+@pytest.mark.parametrize(("size", "warned"), [(0.02, True), (0.4, False)])
+def test_shapes_too_small_for_the_nodes_are_announced(scenes, monkeypatch, size, warned):
+    """Rays from nodes around small shapes rarely hit them: floors around these are too bright."""
+    pebble = {"type": "sphere", "center": [1.8, size - 1.1, 0], "radius": size}
+    objects = {"box": bound(interior=fog()), "floor": ground(), "pebble": pebble}
+    scene = scene_of(scenes, objects | {"emitter": scenes.sky}, solver="sweep")
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
+    scenes.image(scene, spp=4)
+    assert any('"pebble"' in m and "is small" in m for m in messages) == warned
+
+
 def test_edits_of_a_surface_are_seen(scenes):
     scene = scene_of(scenes, within())
     scenes.image(scene, spp=2)
