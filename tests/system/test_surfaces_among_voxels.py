@@ -196,6 +196,20 @@ def test_the_same_seed_gives_the_same_bits(scenes):
     assert np.array_equal(np.array(first[1].irradiance), np.array(again[1].irradiance))
 
 
+def test_objects_that_few_tracks_meet(scenes):
+    """Some ordinates have no track that meets a lamp much smaller than a voxel. The irradiance of
+    the fog is that of a lamp of the same power that all meet.
+    """
+    found = []
+    for radius in (0.003, 0.02):
+        emitter = {"type": "area", "radiance": 0.02 / radius**2}
+        small = ball((0.05, 0.02, 0.03), radius, emitter=emitter)
+        objects = {"box": bound(interior=fog((0.6,) * 3)), "lamp": small, "sun": None}
+        _, cache = rendered(scenes, objects | {"emitter": None}, resolution=12)
+        found.append(np.array(cache.irradiance).mean())
+    assert found[0] == pytest.approx(found[1], rel=0.05)
+
+
 def test_edited_objects_are_solved_for_anew(scenes):
     """An object that is moved, or painted, gives the image of a fresh scene."""
     objects = object_named("coloured ball") | {"fog": bound("cube", fog())}

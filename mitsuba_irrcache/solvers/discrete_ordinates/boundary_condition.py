@@ -212,8 +212,10 @@ class IncomingRadiance:
             # Coarser levels, which only correct the solution, do without surfaces among the voxels.
             table.crossings = self.crossings.of_table(numbers)
             begin, end = (int(2 * self.crossings.starts[n]) for n in (numbers[0], numbers[-1] + 1))
-            own = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, self._count + begin)
-            here, first_crossing = concatenated([here, own]), count - begin
+            first_crossing = count - begin
+            if end > begin:  # some sets of tracks meet no surface
+                own = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, self._count + begin)
+                here = concatenated([here, own])
         values = [
             concatenated([dr.gather(mi.Float, kind[c], here) for c in channels])
             for kind in (self.reflected, *([self.emitted] if emitted else []))
