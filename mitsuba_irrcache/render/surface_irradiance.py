@@ -146,17 +146,25 @@ class SurfaceIrradiance:
         self, scene: mi.Scene, p: mi.Point3f, normal: mi.Normal3f, nearby: mi.UInt32
     ) -> mi.UInt32:
         """Return the number of the medium in front of surfaces at ``p``; ``nearby`` is that of a
-        point nearby, of which the extent may be known from its data only.
+        point nearby.
+
+        It is the medium of that point if no other one has ``p`` in its boundary: rays can miss a
+        boundary that nearly coincides with a wall.
         """
         vertex = dr.zeros(mi.Interaction3f, dr.width(p))
         vertex.p, vertex.n = p, normal
         ray = vertex.spawn_ray(mi.Vector3f(normal))
         found = self.paths.media.number_of(probe(scene, ray.o, ray.d))
+        around, kept, unknown = mi.UInt32(0), mi.Bool(False), mi.Bool(False)
         for number, grid in enumerate(self.paths.media.grids, 1):
-            if not grid.has_exact_boundary:
-                unknown = (found == 0) & (nearby == number) & grid.contains(ray.o)
-                found = dr.select(unknown, number, found)
-        return found
+            within = grid.contains(ray.o)
+            around += dr.select(within, mi.UInt32(1), 0)
+            own = within & (nearby == number)
+            kept |= own & grid.has_exact_boundary
+            # The extent of some media is known from their data only.
+            unknown |= own & (not grid.has_exact_boundary)
+        found = dr.select(kept & (around == 1) | unknown & (found == 0), nearby, found)
+        return dr.select(around == 0, 0, found)
 
     def _ray_from(
         self,
