@@ -95,6 +95,7 @@ def compile_scene(
         _warn_of_normals(emitter)
     for sensor in scene.sensors():
         check_sensor(scene, sensor)
+    has_surfaces = _has_surfaces(scene)
     boundary = _boundary_without_surfaces(scene, media)
     is_isolated = boundary is not None
     if is_isolated and _is_isotropic(*media):
@@ -109,7 +110,8 @@ def compile_scene(
             _check_general(scene, media)
         unscaled, names, reason = _baked(scene, media, emission, is_isolated, max_depth)
         brightest = dr.opaque(mi.Float, _brightest(scene))
-        bound = dr.opaque(mi.Float, _background_bound(scene, float(brightest[0])))
+        largest = _background_bound(scene, float(brightest[0]), has_surfaces)
+        bound = dr.opaque(mi.Float, largest)
         if emission is not None:
             check_emission_is_within(emission, [grid.frame for grid in unscaled])
         grids = tuple(_among_others(unscaled, number, names) for number in range(len(unscaled)))
@@ -121,7 +123,6 @@ def compile_scene(
     for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
-    has_surfaces = _has_surfaces(scene)
     return SceneDescription(Media(grids), visible, emitters, brightest, bound, has_surfaces)
 
 
@@ -519,7 +520,7 @@ def _brightest(scene: mi.Scene) -> float:
     return max(f for f in found if np.isfinite(f))
 
 
-def _background_bound(scene: mi.Scene, brightest: float) -> float:
+def _background_bound(scene: mi.Scene, brightest: float, has_surfaces: bool) -> float:
     """Estimate an upper bound of the radiance behind media: ``brightest``, that of the environment
     in the directions that Mitsuba samples from it, which find a small sun, and what surfaces may
     reflect of suns and point-like emitters.
@@ -534,7 +535,7 @@ def _background_bound(scene: mi.Scene, brightest: float) -> float:
     found = [brightest]
     for emitter in scene.emitters():
         kind = kind_of(emitter)
-        if kind.is_environment or (kind in REFLECTED and _has_surfaces(scene)):
+        if kind.is_environment or (has_surfaces and kind in REFLECTED):
             record, value = emitter.sample_direction(vertex, sample)
             # The weight of a direction is the radiance over its density, or an irradiance.
             value *= record.pdf if kind.is_environment else 1

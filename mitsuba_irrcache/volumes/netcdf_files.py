@@ -127,6 +127,39 @@ def read_variable(
     ``derive`` computes other values from it, at the file's own levels: products and quotients of
     several variables are not those of interpolated ones.
     """
+    source, values, unit, placed = _levels(path, dataset, name, options)
+    if derive is not None:
+        values = derive(values)
+    for number, axis in enumerate("zyx"):
+        if not placed[axis].is_even:
+            source += f" (levels along {axis} interpolated to even ones)"
+            values = _interpolated(values, number, placed[axis])
+    return VolumeData(
+        values,
+        tuple(placed[axis].spacing for axis in "xyz"),
+        tuple(float(placed[axis].positions[0]) for axis in "xyz"),
+        unit=str(dataset[name].attrs.get("units", "")),
+        length_unit=unit,
+        source=source,
+    )
+
+
+def values_at_levels(
+    path: Path, dataset: xarray.Dataset, name: str, options: ReadOptions
+) -> np.ndarray:
+    """Return the values (z, y, x) of one variable at the file's own levels, float64."""
+    _, values, *_ = _levels(path, dataset, name, options)
+    return values.astype(np.float64)
+
+
+def _levels(
+    path: Path, dataset: xarray.Dataset, name: str, options: ReadOptions
+) -> tuple[str, np.ndarray, str, dict[str, _Axis]]:
+    """Read one variable at the file's own levels, in increasing order of coordinates.
+
+    Returns what messages call it, its values (z, y, x), and the unit of length and the coordinates
+    along each axis.
+    """
     variable, source = dataset[name], f"{path}[{name}]"
     axes = spatial_axes(variable)
     letters = "".join(_letter(dimension, axes) for dimension in variable.dims)
@@ -144,34 +177,7 @@ def read_variable(
     for number, axis in enumerate("zyx"):
         if placed[axis].is_reversed:
             values = np.flip(values, number)
-    if derive is not None:
-        values = derive(values)
-    for number, axis in enumerate("zyx"):
-        if not placed[axis].is_even:
-            source += f" (levels along {axis} interpolated to even ones)"
-            values = _interpolated(values, number, placed[axis])
-    return VolumeData(
-        values,
-        tuple(placed[axis].spacing for axis in "xyz"),
-        tuple(float(placed[axis].positions[0]) for axis in "xyz"),
-        unit=str(variable.attrs.get("units", "")),
-        length_unit=unit,
-        source=source,
-    )
-
-
-def values_at_levels(
-    path: Path, dataset: xarray.Dataset, name: str, options: ReadOptions
-) -> np.ndarray:
-    """Return the values (z, y, x) of one variable at the file's own levels, float64."""
-    found = []
-
-    def keep(values: np.ndarray) -> np.ndarray:
-        found.append(values.astype(np.float64))
-        return values
-
-    read_variable(path, dataset, name, options, keep)
-    return found[0]
+    return source, values, unit, placed
 
 
 def _check_zarr(source: str, folder: Path, name: str) -> None:
