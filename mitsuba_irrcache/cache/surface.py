@@ -5,11 +5,11 @@ the number of triangles nor the merging of shapes matters. Around a surface poin
 square lattice across the dominant axis of the geometric normal, projected onto the surface along
 that axis. Bilinear interpolation between four of them is exact for linear functions on a plane.
 
-Lattices have spacings of ``spacing / 2^level``. The coarsest level at a point grows with its
-distance from the media. A point uses finer levels until the spacing is small compared to the
-harmonic mean distance of the surfaces visible from its nodes (Ward, Rubinstein and Clear, "A ray
-tracing solution for diffuse interreflection", 1988), and until the surface is nearly flat between
-nodes.
+Lattices have spacings of ``spacing / 2^level``. The coarsest spacing at a point grows with its
+distance from the media, up to a bound that depends on how the point is seen (`SpacingBounds`). A
+point uses finer levels until the spacing is small compared to the harmonic mean distance of the
+surfaces visible from its nodes (Ward, Rubinstein and Clear, "A ray tracing solution for diffuse
+interreflection", 1988), and until the surface is nearly flat between nodes.
 
 A node is identified by a 64-bit key: axis and side, level, two lattice coordinates, and the
 interval of the third coordinate in which the surface lies. The position of a node thus depends on
@@ -29,9 +29,6 @@ from mitsuba_irrcache.core.jit import concatenated, symbolic
 
 #: Node number of keys that are not in the table.
 NONE = 0xFFFFFFFF
-#: Number of levels below the coarsest one for points seen by the camera, and for points seen only
-#: from other nodes.
-LEVELS, INDIRECT_LEVELS = 6, 3
 #: Spacing of the lattice at level 0 over the diagonal of the media's box; distance from the box, in
 #: units of that spacing, at 2^k times which level -k begins, for k > 0.
 COARSEST, COARSER_BEYOND = 0.25, 2.0
@@ -45,16 +42,23 @@ TANGENT = 0.3
 #: Distance of another surface from a node, over the spacing, below which this surface may lie
 #: between nodes, as in corners and below objects.
 CLEARANCE = 1.5
-#: Extent of a shape over the coarsest spacing at its place below which its occlusion of indirect
-#: radiance may be missed: the rays from nodes around it, which finer levels depend on, rarely hit
-#: it. With 0.09, blocks of pixels around pebbles are 17 % of the image's mean too bright; with 0.2,
-#: 5 %; with 0.02, 11 to 30 %.
-SMALL_SHAPE = 0.15
+#: Largest level: finer lattices would be finer than the rounding of positions.
+FINEST_LEVEL = 24
 #: Offset of the lattices' origin, so that planes at round coordinates are not on the boundary of
 #: two intervals.
 SHIFT = np.array([0.2137, 0.3719, 0.4482])
 #: Bits of a coordinate, and offsets that make coordinates and levels positive.
 BITS, OFFSET, LEVEL_OFFSET = 18, 1 << 17, 32
+
+
+class SpacingBounds(NamedTuple):
+    """Bounds of the spacing of the nodes for a point [scene units]: that of the first level used
+    there is at most ``coarsest``, and levels end with the first whose spacing is at most
+    ``finest``.
+    """
+
+    coarsest: mi.Float
+    finest: mi.Float
 
 
 class _SurfacePoint(NamedTuple):
@@ -109,11 +113,6 @@ class SurfaceNodes:
         self._geometric = mi.Float([0.0] * 4)
         self._slots, self._mask = mi.UInt32([NONE, NONE]), dr.opaque(mi.UInt32, 1)
 
-    def coarsest_spacing(self, p: np.ndarray) -> float:
-        """Return the spacing of the coarsest lattice at a world position (3,) [scene units]."""
-        level = self._coarsest_level(mi.Point3f(*(float(x) for x in p)))
-        return float(self._spacing_at(level)[0])
-
     # Lookup
 
     @symbolic
@@ -121,21 +120,20 @@ class SurfaceNodes:
         self,
         p: mi.Point3f,
         normals: tuple[mi.Normal3f, mi.Normal3f],
-        most_levels: mi.UInt32,
+        bounds: SpacingBounds,
         active: mi.Bool,
     ):
         """Find the nodes between which to interpolate at ``p`` with these ``normals``, geometric
-        and shading.
+        and shading, with a spacing within ``bounds``.
 
-        Levels are searched from the coarsest one at ``p``, at most ``most_levels`` finer ones.
         Returns the numbers of four nodes; their weights, whose sum is 1, or 0 if a node is missing;
         whether another surface may lie between the nodes; the four keys at the last level visited;
         and whether any of these keys is missing in the table.
         """
         # docs/primer, eq. (5.7)
         point = _SurfacePoint(p, *normals, *_across(normals[0], mi.Vector3f(p - self._origin)))
-        level = self._coarsest_level(p)
-        last = level + mi.Int32(most_levels)
+        level = dr.maximum(self._coarsest_level(p), self._level_of(bounds.coarsest))
+        last = self._level_of(bounds.finest)
         numbers = [mi.UInt32(0) for _ in range(4)]
         weights = [mi.Float(0) for _ in range(4)]
         keys = [mi.UInt64(0) for _ in range(4)]
@@ -192,11 +190,16 @@ class SurfaceNodes:
         )
 
     def _coarsest_level(self, p: mi.Point3f) -> mi.Int32:
-        """Return the level at which the search begins at ``p``."""
+        """Return the level at which the search begins at ``p``, if no bound is finer."""
         away = dr.maximum(dr.maximum(self._lower - p, p - self._upper), 0)
         ratio = dr.norm(away) / (COARSER_BEYOND * self.spacing)
         exponent = mi.Int32(dr.floor(dr.log2(dr.maximum(ratio, 1))))
         return -dr.minimum(exponent, LEVEL_OFFSET - 1)
+
+    def _level_of(self, spacing: mi.Float) -> mi.Int32:
+        """Return the first level with at most this ``spacing``."""
+        level = dr.ceil(dr.log2(self.spacing / spacing))
+        return mi.Int32(dr.clip(level, 1 - LEVEL_OFFSET, FINEST_LEVEL))
 
     def _spacing_at(self, level: mi.Int32) -> mi.Float:
         power = dr.reinterpret_array(mi.Float, mi.UInt32(127 - level) << 23)

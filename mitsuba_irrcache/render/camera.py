@@ -28,10 +28,10 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import release_unused_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
-from mitsuba_irrcache.render.film import CameraSampler, scattered_rays
+from mitsuba_irrcache.render.film import CameraSampler, scattered_rays, view_extent
 from mitsuba_irrcache.render.raymarch import CachedFields, Projection
 from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
-from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance, warn_of_small_shapes
+from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance
 from mitsuba_irrcache.render.surface_paths import SurfacePaths
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
@@ -310,13 +310,13 @@ class TracedCameraRays:
         is_worth_it = samples >= FEWEST_SAMPLES or self._refracts or self.narrow is not None
         if self._emitters is None or not is_worth_it:
             return
-        if self._surfaces is None:
+        view = view_extent(sensor)
+        if self._surfaces is None or not self._surfaces.has_space_for(view):
             self._surfaces = SurfaceIrradiance(self._paths(), seed)
-            warn_of_small_shapes(scene, self._surfaces.paths.nodes)
         ray = scattered_rays(sensor, PLACEMENT_RAYS)
         medium = sensor.get_medium()
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
-        self._surfaces.prepare(scene, ray, pointer)
+        self._surfaces.prepare(scene, view, ray, pointer)
         self.caches_surfaces = True
 
     def sample(
@@ -346,7 +346,7 @@ class TracedCameraRays:
             else:
                 on_emitter = EmitterSample(sampler.next_2d(traced))
             direct, reflected, interacted, *_ = self._surfaces.paths.follow(
-                scene, end, pointer, rng, traced, on_emitter, self.hide_emitters
+                scene, end, pointer, rng, traced, on_emitter, self.hide_emitters, marched.near
             )
         else:
             start = PathStart(end, pointer, depth=0, pdf=0.0, clear=True)

@@ -11,9 +11,11 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from threading import Lock, RLock
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.core.jit import Divisor
 from mitsuba_irrcache.core.sequences import kronecker, kronecker_words, unit_floats
@@ -356,6 +358,43 @@ def scattered_rays(sensor: mi.Sensor, least: int) -> mi.Ray3f:
     time = mi.Float(sensor.shutter_open() + 0.5 * sensor.shutter_open_time())
     ray, _ = sensor.sample_ray(time, 0.5, position * scale, mi.Point2f(0.5))
     return ray
+
+
+class ViewExtent(NamedTuple):
+    """Extent of what an image shows at a distance from the sensor.
+
+    Attributes:
+        at_sensor: extent at the sensor [scene units].
+        per_distance: growth of the extent with distance.
+        pixels: number of pixels along it.
+        position, direction: means over the image of where rays start, and of their directions.
+    """
+
+    at_sensor: float
+    per_distance: float
+    pixels: float
+    position: tuple[float, float, float]
+    direction: tuple[float, float, float]
+
+
+def view_extent(sensor: mi.Sensor) -> ViewExtent:
+    """Measure the extent of what an image shows by the rays of neighbouring pixels."""
+    film, count = sensor.film(), 16
+    size, scale = np.array(film.size(), float), 1 / np.array(film.crop_size(), float)
+    lane, axis = np.divmod(np.arange(2 * count * count), 2)
+    position = (np.stack([lane % count, lane // count]) + 0.5) / count * size[:, None]
+    position -= np.array(film.crop_offset(), float)[:, None]
+    rays = []
+    for side in (-0.5, 0.5):
+        on_film = (position + side * np.stack([axis == 0, axis == 1])) * scale[:, None]
+        time = mi.Float(sensor.shutter_open())
+        ray, _ = sensor.sample_ray(time, 0.5, mi.Point2f(np.float32(on_film)), mi.Point2f(0.5))
+        rays.append(ray)
+    first, second = rays
+    apart = dr.norm(second.o - first.o), dr.norm(second.d - first.d)
+    extent = (float(np.median(np.array(each) * size[axis])) for each in apart)
+    means = (tuple(np.array(each).mean(axis=1).tolist()) for each in (first.o, first.d))
+    return ViewExtent(*extent, float(np.sqrt(size.prod())), *means)
 
 
 def _sampled(

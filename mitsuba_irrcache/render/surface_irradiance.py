@@ -15,17 +15,15 @@ from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mitsuba_irrcache.cache.angular import Source
-from mitsuba_irrcache.cache.surface import SMALL_SHAPE, SurfaceNodes
 from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
+from mitsuba_irrcache.render.film import ViewExtent
 from mitsuba_irrcache.render.surface_paths import SurfacePaths
 from mitsuba_irrcache.render.surface_vertices import facing, lambertian
-from mitsuba_irrcache.scene.consistency import described
 from mitsuba_irrcache.scene.medium_probe import probe
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null, is_surface
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
 #: Number of rays by which a node measures the distances of its surroundings; by which a node that
 #: camera rays need samples its irradiance; by which other nodes do.
@@ -64,13 +62,22 @@ class SurfaceIrradiance:
         self._groups = list(groups)
         self._exchange: list[Exchange] = []
         self._gathered = 0  # groups
+        self._view: ViewExtent | None = None  # the last one
 
     def renewed(self, paths: SurfacePaths) -> SurfaceIrradiance:
         """Return the same nodes, with irradiance gathered again along ``paths``."""
         return SurfaceIrradiance(paths, self.seed, self._groups)
 
-    def prepare(self, scene: mi.Scene, ray: mi.Ray3f, pointer: mi.MediumPtr) -> None:
-        """Create the nodes that these camera rays need, and compute their irradiance."""
+    def has_space_for(self, view: ViewExtent) -> bool:
+        """Return whether nodes for ``view`` can be added, or were computed last."""
+        return self.nodes.count < MOST_NODES or view == self._view
+
+    def prepare(
+        self, scene: mi.Scene, view: ViewExtent, ray: mi.Ray3f, pointer: mi.MediumPtr
+    ) -> None:
+        """Create the nodes that camera rays of a ``view`` need, and compute their irradiance."""
+        self._view = view
+        self.paths.bound_spacing(view)
         rng = random_stream(mi.sample_tea_32(dr.arange(mi.UInt32, dr.width(ray)), self._seed))
         place, found, _ = self.paths.walk(scene, ray, pointer, rng, mi.Bool(True))
         self._cover(scene, place, found)
@@ -94,12 +101,13 @@ class SurfaceIrradiance:
                 index = dr.compress(active)
                 if not dr.width(index):
                     break
-                p, normals, medium = place
+                p, normals, medium, travelled = place
                 p, medium = dr.gather(mi.Point3f, p, index), dr.gather(mi.UInt32, medium, index)
                 normals = tuple(dr.gather(mi.Normal3f, n, index) for n in normals)
-                place = p, normals, medium
-                levels = self.paths.indirect_levels if generation else self.paths.levels
-                *_, keys, active = self.nodes.find(p, normals, levels, mi.Bool(True))
+                travelled = dr.gather(mi.Float, travelled, index)
+                place = p, normals, medium, travelled
+                bounds = self.paths.spacing_bounds(p, travelled, from_node=generation > 0)
+                *_, keys, active = self.nodes.find(p, normals, bounds, mi.Bool(True))
                 dr.eval(place, keys, active)
                 missing = dr.compress(active)
                 if not dr.width(missing):
@@ -345,29 +353,3 @@ def _first_surface(scene: mi.Scene, ray: mi.Ray3f, length: mi.Float):
         crossings += 1
         active &= crossings < MOST_CROSSINGS
     return position, (geometric, shading), found
-
-
-def warn_of_small_shapes(scene: mi.Scene, nodes: SurfaceNodes) -> None:
-    """Log a warning for surfaces that are small compared to the spacing of ``nodes`` around them,
-    whose occlusion of radiance from the sky and from other surfaces may be missed.
-    """
-    small = []
-    for shape in scene.shapes():
-        ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
-        if not is_surface(shape) or shape.is_emitter() or not np.isfinite(ends).all():
-            continue
-        extent = float((ends[1] - ends[0]).max())
-        spacing = nodes.coarsest_spacing(ends.mean(axis=0))
-        if 0 < extent < SMALL_SHAPE * spacing:
-            small.append((extent / spacing, shape, spacing))
-    if small:
-        _, shape, spacing = min(small, key=lambda each: each[0])
-        others = f" and {len(small) - 1} more" if len(small) > 1 else ""
-        mi.Log(
-            mi.LogLevel.Warn,
-            f"irrcache: {described(shape)}{others} is small compared to the spacing of the nodes "
-            f"of irradiance on surfaces, {spacing:.2g} there, which follows from the size of the "
-            "media and the distance from them: floors and walls around it may be up to a third too "
-            "bright, since its occlusion of indirect radiance is missed. Render such views with "
-            '"volpath".',
-        )

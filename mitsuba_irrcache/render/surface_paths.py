@@ -20,10 +20,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import Scattering
-from mitsuba_irrcache.cache.surface import INDIRECT_LEVELS, LEVELS, SurfaceNodes
+from mitsuba_irrcache.cache.surface import SpacingBounds, SurfaceNodes
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.lights.emitters import are_distant
 from mitsuba_irrcache.lights.narrow_sources import Source
+from mitsuba_irrcache.render.film import ViewExtent
 from mitsuba_irrcache.render.path_splitting import no_waiting, resumed, split
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
@@ -59,6 +60,15 @@ PEAK_DISTANCE = 0.25
 #: Height above the surface, over their distance, at which the visibility between a point and a node
 #: is tested: chords of curved surfaces lie below these.
 CHORD = 0.1
+#: Largest spacing of nodes over the extent of the image at their distance, and its smallest value
+#: in pixels: rays from the nodes then find objects that are visible in the image.
+COARSEST_IN_VIEW, COARSEST_PIXELS = 1 / 32, 4.0
+#: Smallest spacing of nodes in pixels where camera rays end; over the extent of the image where
+#: rays from nodes end.
+FINEST_PIXELS, FINEST_IN_VIEW = 0.5, 1 / 64
+#: Largest and smallest spacing of nodes over the length of the rays from other nodes to them, where
+#: that is more.
+COARSEST_FROM_NODES, FINEST_FROM_NODES = 1 / 2, 1 / 16
 #: Corners of the unit cube in homogeneous coordinates.
 UNIT_CUBE = np.array([[x, y, z, 1.0] for x in (0, 1) for y in (0, 1) for z in (0, 1)]).T
 
@@ -94,12 +104,34 @@ class SurfacePaths:
         )
         self._original_media = media.original()
         self.peak_distance = dr.opaque(mi.Float, PEAK_DISTANCE)
-        #: levels of nodes for points that the camera sees, and for others
-        self.levels, self.indirect_levels = (
-            dr.opaque(mi.UInt32, n) for n in (LEVELS, INDIRECT_LEVELS)
-        )
+        self._view_extent = mi.Float(0), mi.Float(0)
+        self._camera = mi.Point3f(0)
+        self._finest_in_view = mi.Float(0)
+        self._finest_from_nodes = mi.Float(0)
         #: irradiance of the nodes, one array for each channel
         self.irradiance = [mi.Float(0) for _ in range(dr.size_v(mi.Spectrum))]
+
+    def bound_spacing(self, view: ViewExtent) -> None:
+        """Bound the spacing of nodes by what an image shows."""
+        across = max(COARSEST_IN_VIEW, COARSEST_PIXELS / view.pixels)
+        self._camera = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in view.position))
+        self._view_extent = tuple(
+            dr.opaque(mi.Float, across * x) for x in (view.at_sensor, view.per_distance)
+        )
+        self._finest_from_nodes = dr.opaque(mi.Float, FINEST_IN_VIEW / across)
+        self._finest_in_view = dr.opaque(mi.Float, FINEST_PIXELS / across / view.pixels)
+
+    def spacing_bounds(self, p: mi.Point3f, travelled: mi.Float, from_node: bool) -> SpacingBounds:
+        """Return the bounds of the spacing of nodes at ``p``, where a path ends that has
+        ``travelled`` this distance from a node or from the camera.
+        """
+        at_sensor, per_distance = self._view_extent
+        distance = dr.norm(p - self._camera) if from_node else travelled
+        coarsest = dr.fma(per_distance, distance, at_sensor)
+        if from_node:
+            finest = dr.maximum(coarsest * self._finest_from_nodes, FINEST_FROM_NODES * travelled)
+            return SpacingBounds(dr.maximum(coarsest, COARSEST_FROM_NODES * travelled), finest)
+        return SpacingBounds(coarsest, coarsest * self._finest_in_view)
 
     @property
     def narrow_sources(self) -> tuple[Source, ...]:
@@ -116,9 +148,11 @@ class SurfacePaths:
         active: mi.Bool,
         on_emitter: EmitterSample | None = None,
         hide_emitters: bool = False,
+        travelled: mi.Float | None = None,
     ):
         """Follow paths that begin with ``ray`` in the medium ``pointer``: at a node or, if samples
-        ``on_emitter`` for the first vertex are given, at a camera ray's end before a surface.
+        ``on_emitter`` for the first vertex are given, at a camera ray's end before a surface, which
+        has ``travelled`` this distance from the camera.
 
         Returns the radiance of emitters at the first surface, all other radiance, whether there was
         any interaction, and the node whose irradiance has to be added with the returned factor
@@ -126,6 +160,8 @@ class SurfacePaths:
         """
         follower = _PathFollower(self, scene, on_emitter, hide_emitters)
         path, sums = follower.begin(ray, pointer, rng, active)
+        if travelled is not None:
+            path.travelled = mi.Float(travelled)
         while dr.hint(path.active, label="surface paths"):
             follower.advance(path, sums)
         return sums.emitted, sums.radiance, sums.interacted, sums.end_number, sums.end_factor
@@ -270,9 +306,9 @@ class SurfacePaths:
     def walk(self, scene, ray, pointer, rng, active):
         """Follow rays through null, glossy and specular surfaces to the first diffuse one.
 
-        Returns its position, its geometric and shading normal, and the number of the medium before
-        it; whether there is one; and the distances of the first surface or medium, and of the first
-        surface (infinite where there is none).
+        Returns its position, its geometric and shading normal, the number of the medium before it,
+        and the length of the path to it; whether there is one; and the distances of the first
+        surface or medium, and of the first surface (infinite where there is none).
         """
         ray, pointer = mi.Ray3f(ray), mi.MediumPtr(pointer)
         position, geometric, shading = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
@@ -313,7 +349,7 @@ class SurfacePaths:
             active &= (crosses | scatters) & (bounces < MOST_BOUNCES)
             active &= crossings < MOST_CROSSINGS
         distances = dr.minimum(nearest, nearest_surface), nearest_surface
-        place = position, (geometric, shading), self.media.number_of(before)
+        place = position, (geometric, shading), self.media.number_of(before), travelled
         return place, found, distances
 
 
@@ -337,6 +373,8 @@ class _FollowedPath:
     clear: mi.Bool
     depth: mi.UInt32
     crossings: mi.UInt32
+    #: length of the path so far
+    travelled: mi.Float
     #: places for paths that were split off
     waiting: list
     rng: mi.PCG32
@@ -388,6 +426,7 @@ class _PathFollower:
             clear=mi.Bool(not self._from_node),
             depth=mi.UInt32(0),
             crossings=mi.UInt32(0),
+            travelled=mi.Float(0),
             waiting=no_waiting(ray, pointer) if self._splits else [],
             rng=rng,
             active=mi.Bool(active),
@@ -401,6 +440,7 @@ class _PathFollower:
         si = self._scene.ray_intersect(path.ray, path.active)
         self._march_media(path, sums, si)
         valid = path.active & si.is_valid()
+        path.travelled += dr.select(valid, si.t, 0)
         self._add_hit_emitter(path, sums, si, valid)
         crosses = valid & is_null(si.bsdf().flags())
         surface = valid & ~crosses
@@ -488,8 +528,8 @@ class _PathFollower:
         paths = self._paths
         diffuse, factor = lambertian(si, surface)
         normals = facing(si, path.ray.d)
-        levels = paths.indirect_levels if self._from_node else paths.levels
-        numbers, weights, uncertain, _, _ = paths.nodes.find(si.p, normals, levels, diffuse)
+        bounds = paths.spacing_bounds(si.p, path.travelled, self._from_node)
+        numbers, weights, uncertain, _, _ = paths.nodes.find(si.p, normals, bounds, diffuse)
         weights = paths.visible(self._scene, si, numbers, weights, diffuse & uncertain)
         ends = diffuse & (weights[0] + weights[1] + weights[2] + weights[3] > 0)
         if self._from_node:

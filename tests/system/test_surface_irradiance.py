@@ -274,16 +274,39 @@ def test_nodes_have_the_medium_of_their_own_place(scenes):
     np.testing.assert_array_equal((medium == 1)[known & apart], inside[known & apart])
 
 
-@pytest.mark.parametrize(("size", "warned"), [(0.02, True), (0.4, False)])
-def test_shapes_too_small_for_the_nodes_are_announced(scenes, monkeypatch, size, warned):
-    """Rays from nodes around small shapes rarely hit them: floors around these are too bright."""
-    pebble = {"type": "sphere", "center": [1.8, size - 1.1, 0], "radius": size}
-    objects = {"box": bound(interior=fog()), "floor": ground(), "pebble": pebble}
-    scene = scene_of(scenes, objects | {"emitter": scenes.sky}, solver="sweep")
-    messages = []
-    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
-    scenes.image(scene, spp=4)
-    assert any('"pebble"' in m and "is small" in m for m in messages) == warned
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize(
+    ("center", "size"), [((0, 9, 0), 3.0), ((40, 70, 30), 9.0), ((0, 900, 0), 200.0)]
+)
+def test_objects_seen_by_the_camera_occlude_the_sky_however_far_the_medium(
+    scenes, projection, center, size
+):
+    """The irradiance of a floor below a black ball has a closed form. The spacing of nodes must
+    follow from the view: with one that follows from the medium, their rays miss the ball.
+    """
+    radius, height, albedo = 0.05, 0.07, 0.6
+    objects = {
+        "medium": bound(interior=fog((1e-7,) * 3), center=center, scale=(size,) * 3),
+        "floor": ground(height=0, bsdf=diffuse(*[albedo] * 3)),
+        "ball": ball((0, height, 0), radius, bsdf=diffuse(0, 0, 0)),
+        "emitter": {"type": "constant", "radiance": 1.0},
+    }
+    scene = scene_of(scenes, objects, solver="sweep")
+    look = mi.ScalarTransform4f().look_at([0, 0.8, 0], [0, 0, 0], [0, 0, 1])
+    size_on_film = {"fov": 40.0} if projection == "perspective" else {}
+    if projection == "orthographic":
+        look = look @ mi.ScalarTransform4f().scale([0.3, 0.3, 1])
+    film_of = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    sensor = mi.load_dict({"type": projection, "to_world": look, "film": film_of} | size_on_film)
+    image = np.array(mi.render(scene, sensor=sensor, spp=64), dtype=float).mean(axis=-1)
+    half = 0.8 * np.tan(np.radians(20)) if size_on_film else 0.3
+    x = (np.arange(SIZE) + 0.5) / SIZE * 2 * half - half
+    from_axis = np.hypot(*np.meshgrid(x, x))
+    form_factor = radius**2 * height / (from_axis**2 + height**2) ** 1.5
+    on_floor = from_axis > 1.5 * radius  # beside the ball, seen from above
+    expected = albedo * (1 - form_factor)
+    np.testing.assert_allclose(image[on_floor], expected[on_floor], rtol=0.02)
+    assert np.ptp(expected[on_floor]) > 0.05  # against 0.6
 
 
 def test_edits_of_a_surface_are_seen(scenes):

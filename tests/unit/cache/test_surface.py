@@ -7,7 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache.surface import CLEARANCE, LEVELS, SPACING_PER_DISTANCE, SurfaceNodes
+from mitsuba_irrcache.cache.surface import (
+    CLEARANCE,
+    SPACING_PER_DISTANCE,
+    SpacingBounds,
+    SurfaceNodes,
+)
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -22,19 +27,31 @@ PLANES = {
 }
 
 
+def bounds(coarsest: float = 1e9, finest: float = 0.01) -> SpacingBounds:
+    return SpacingBounds(*(dr.opaque(mi.Float, x) for x in (coarsest, finest)))
+
+
 def points(normal: np.ndarray, offset: float, count: int = 200, seed: int = 1) -> np.ndarray:
     """Return random points (3, n) of a plane around the box."""
     u = np.random.default_rng(seed).uniform(-1.5, 1.5, (3, count))
     return u + normal[:, None] * (offset - normal @ u)
 
 
-def cover(nodes: SurfaceNodes, plane: tuple, p: np.ndarray, distance: float, clearance: float):
+def cover(
+    nodes: SurfaceNodes,
+    plane: tuple,
+    p: np.ndarray,
+    distance: float,
+    clearance: float,
+    within: SpacingBounds | None = None,
+):
     """Create all nodes for points of a plane; return normals and the number of rounds."""
+    within = within or bounds()
     normal, offset = plane
     p = mi.Point3f(np.float32(p))
     normals = (mi.Normal3f(*(dr.full(mi.Float, float(x), dr.width(p)) for x in normal)),) * 2
     for rounds in range(20):
-        *_, keys, missing = nodes.find(p, normals, mi.UInt32(LEVELS), mi.Bool(True))
+        *_, keys, missing = nodes.find(p, normals, within, mi.Bool(True))
         dr.eval(keys, missing)
         index = dr.compress(missing)
         if not dr.width(index):
@@ -66,7 +83,7 @@ def test_interpolation_is_exact_for_linear_functions(plane):
     plane = unit(plane)
     nodes = SurfaceNodes(LOWER, UPPER)
     p, normals, _ = cover(nodes, plane, points(*plane), 1.0, 9.0)
-    numbers, weights, uncertain, _, _ = nodes.find(p, normals, mi.UInt32(LEVELS), mi.Bool(True))
+    numbers, weights, uncertain, _, _ = nodes.find(p, normals, bounds(), mi.Bool(True))
     total = sum(weights)
     found = [
         sum(w * x for w, x in zip(weights, axis, strict=True))
@@ -82,7 +99,7 @@ def test_spacing_follows_the_distances_that_nodes_see(distance):
     plane = unit(PLANES["slope"])
     nodes = SurfaceNodes(LOWER, UPPER)
     p, normals, _ = cover(nodes, plane, points(*plane), distance, 9.0)
-    numbers, weights, *_ = nodes.find(p, normals, mi.UInt32(LEVELS), mi.Bool(True))
+    numbers, weights, *_ = nodes.find(p, normals, bounds(), mi.Bool(True))
     farthest = max(
         float(dr.max(dr.select(w > 1e-5, dr.norm(nodes.positions(n)[0] - p), 0))[0])
         for n, w in zip(numbers, weights, strict=True)
@@ -93,12 +110,28 @@ def test_spacing_follows_the_distances_that_nodes_see(distance):
     assert 0.3 * allowed < farthest < 2.5 * allowed
 
 
+@pytest.mark.parametrize(
+    ("coarsest", "finest", "distance", "expected"),
+    [(0.2, 1e-3, 1e9, 0.2), (1e9, 0.1, 1e-6, 0.1), (0.05, 0.1, 1e-6, 0.05)],
+)
+def test_spacing_is_within_its_bounds(coarsest, finest, distance, expected):
+    """What nodes see cannot make the spacing larger than one bound or smaller than the other."""
+    plane, within = unit(PLANES["floor"]), bounds(coarsest, finest)
+    nodes = SurfaceNodes(LOWER, UPPER)
+    p, normals, _ = cover(nodes, plane, points(*plane), distance, 9.0, within)
+    numbers, weights, *_ = nodes.find(p, normals, within, mi.Bool(True))
+    places = [np.array(nodes.positions(n)[0]) for n in numbers]
+    edge = np.linalg.norm(places[1] - places[0], axis=0)
+    np.testing.assert_allclose(np.array(sum(weights)), 1, atol=1e-5)
+    assert 0.49 * expected < edge.min() and edge.max() < 1.01 * expected
+
+
 def test_close_surfaces_make_interpolation_uncertain():
     plane = unit(PLANES["floor"])
     for clearance, expected in ((1e-3, True), (9.0, False)):
         nodes = SurfaceNodes(LOWER, UPPER)
         p, normals, _ = cover(nodes, plane, points(*plane, count=20), 9.0, clearance)
-        _, weights, uncertain, *_ = nodes.find(p, normals, mi.UInt32(LEVELS), mi.Bool(True))
+        _, weights, uncertain, *_ = nodes.find(p, normals, bounds(), mi.Bool(True))
         assert (np.array(uncertain) == expected).all()
         assert (np.array(sum(weights)) > 0.99).all()
     assert CLEARANCE > 1  # nodes on either side of a wall are within a cell of it
@@ -112,7 +145,7 @@ def test_nodes_whose_normals_point_elsewhere_do_not_apply():
     for tilt, expected in ((0.5, 1.0), (0.8, 0.0)):  # cosines of 0.88 and 0.7
         tilted = mi.Normal3f(float(np.sin(tilt)), float(np.cos(tilt)), dr.zeros(mi.Float, 20))
         normals = geometric, tilted
-        _, weights, *_ = nodes.find(p, normals, mi.UInt32(0), mi.Bool(True))
+        _, weights, *_ = nodes.find(p, normals, bounds(finest=1.0), mi.Bool(True))
         np.testing.assert_allclose(np.array(sum(weights)), expected, atol=1e-5)
 
 
@@ -152,6 +185,6 @@ def test_the_opposite_side_of_a_surface_has_other_nodes():
     nodes = SurfaceNodes(LOWER, UPPER)
     p, normals, _ = cover(nodes, plane, points(*plane, count=30), 1.0, 9.0)
     below = tuple(-n for n in normals)
-    _, weights, _, _, missing = nodes.find(p, below, mi.UInt32(LEVELS), mi.Bool(True))
+    _, weights, _, _, missing = nodes.find(p, below, bounds(), mi.Bool(True))
     assert dr.all(missing)[0]
     assert not dr.any(sum(weights) > 0)[0]
