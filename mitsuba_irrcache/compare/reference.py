@@ -68,7 +68,8 @@ def reference_path(
     These are all files of the scene, the parameters, the integrator, the sensor, the variant and
     Mitsuba's version.
     """
-    parts = (scene_digest(scene_file, parameters), integrator, sensor, mi.variant(), mi.__version__)
+    inputs = scene_digest(scene_file, parameters, integrator)
+    parts = (inputs, integrator, sensor, mi.variant(), mi.__version__)
     digest = hashlib.sha256(repr(parts).encode()).hexdigest()
     return folder / f"{scene_file.stem}-{digest[:16]}.npz"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -65,12 +66,12 @@ class Job:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of everything that the result depends on; the folder of the scene does not
-        matter, nor does the name of its file.
+        """SHA-256 of everything that the result depends on; the folders of the scene and of other
+        files do not matter, nor does the name of its file.
         """
         environment = self.environment
         scene = self.arguments.get("scene", {})
-        contents = {key: value for key, value in scene.items() if key != "scene"}
+        contents = {key: scene[key] for key in scene if key not in ("scene", "folder")}
         arguments = self.arguments | {"scene": contents}
         parts = [self.kind, arguments, environment.variant, environment.modules]
         text = json.dumps([*parts, environment.software], sort_keys=True)
@@ -90,15 +91,17 @@ def difference(name: str, found: str | None, wanted: str | None) -> str:
 def scene_arguments(
     scene: str | Path, parameters: dict[str, str], integrator: str | None
 ) -> dict[str, object]:
-    """Return the arguments of a job that name a scene, with the digest of its files.
+    """Return the arguments of a job that name a scene, with the digest of its files, and the folder
+    in which relative names of other files are meant.
 
     The variant has to be set, since Mitsuba's parser finds the files.
     """
-    path = Path(scene).resolve()
+    path, folder = Path(scene).resolve(), os.getcwd()
     return {
         "scene": str(path),
         "parameters": parameters,
         "integrator": integrator,
-        "contents": scene_digest(path, parameters),
+        "folder": folder,
+        "contents": scene_digest(path, parameters, integrator, folder),
         "variant": mi.variant(),
     }

@@ -51,9 +51,9 @@ class SceneStudy:
         ]
 
     def _jobs(self) -> list[Job]:
-        scene = scene_arguments(self._job["scene"], self._job["parameters"], None)
-        jobs = []
+        where, jobs = (self._job["scene"], self._job["parameters"]), []
         for number, integrator in enumerate(self._args.integrator):
+            scene = scene_arguments(*where, integrator)
             name = file_name(number, integrator)
             own = {"scene": scene, "job": self._job, "integrator": integrator, "name": name}
             own["budgets"] = self._budgets

@@ -178,7 +178,9 @@ def measurement(arguments: dict, folder: Path) -> None:
 def _loaded(scene: dict) -> mi.Scene:
     """Load the scene of a job."""
     _check_contents(scene)
-    return load_scene(scene["scene"], scene["parameters"], scene["integrator"])
+    names = "scene", "parameters", "integrator", "folder"
+    path, parameters, integrator, folder = (scene[name] for name in names)
+    return load_scene(path, parameters, integrator, folder=folder)
 
 
 def _check_contents(scene: dict) -> None:
@@ -186,7 +188,8 @@ def _check_contents(scene: dict) -> None:
     path = Path(scene["scene"])
     if not path.is_file():
         raise UnfitWorkerError(f'it has no file "{path}"; use a folder that all machines share')
-    if scene_digest(path, scene["parameters"]) != scene["contents"]:
+    arguments = (scene[name] for name in ("parameters", "integrator", "folder"))
+    if scene_digest(path, *arguments) != scene["contents"]:
         raise UnfitWorkerError(
             f'the files of "{path}" differ there from those here, or were changed since the start'
         )

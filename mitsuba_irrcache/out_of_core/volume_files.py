@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.io.zarr_chunks import check_chunks
+from mitsuba_irrcache.io.zarr_chunks import check_chunks, is_zarr
 from mitsuba_irrcache.machine.extras import require
 
 #: Names of raw files, with sizes along x, y, z and type, as in the Open SciVis data sets.
 RAW_NAME = re.compile(r"_(\d+)x(\d+)x(\d+)_(u?int(?:8|16|32)|float(?:16|32|64))\.raw$")
-#: Names of the file in the folder of a Zarr array, of version 3 and 2 of the format.
-ZARR_MARKS = ("zarr.json", ".zarray")
 
 
 class VolumeFile:
@@ -72,7 +70,7 @@ class VolumeFile:
         return [(name, s.st_size, s.st_mtime_ns, s.st_ino) for name, s in known]
 
     def _opener(self) -> Callable:
-        if any((self.path / mark).is_file() for mark in ZARR_MARKS):
+        if is_zarr(self.path):
             return self._zarr
         if self.path.suffix.lower() == ".npy":
             return self._npy

@@ -88,6 +88,30 @@ def test_a_worker_reads_exr_files_whatever_its_threads(environment, tmp_path):
         dr.set_thread_count(threads)
 
 
+def frame_job(scene: Path, integrator: str, environment: Environment, **parameters: str) -> Job:
+    """Return a job of one frame."""
+    arguments = {"scene": scene_arguments(scene, SMALL | parameters, integrator)}
+    arguments |= {"sensor": 0, "seed": 0, "spp": 1, "file": "frame.exr"}
+    return Job("frame", "frame", arguments, environment)
+
+
+def test_frames_share_a_cache_file_in_the_folder_of_the_command(
+    scene, environment, tmp_path, monkeypatch
+):
+    """Workers run in other folders, and the file is there from the second frame on."""
+    integrator = "irrcache{solver=path,resolution=4,cache_spp=16,cache_file=light.cache}"
+    monkeypatch.chdir(tmp_path)
+    job = frame_job(scene, integrator, environment)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    first = outcome(job, tmp_path / "first")
+    assert (tmp_path / "light.cache").exists() and not any(Path.cwd().iterdir())
+    second = outcome(job, tmp_path / "second")
+    assert second.files["frame.png"] == first.files["frame.png"]
+    monkeypatch.chdir(tmp_path)
+    assert frame_job(scene, integrator, environment).digest == job.digest
+
+
 def test_a_worker_that_sees_other_files_says_so(scene, tmp_path):
     arguments = {"scene": scene_arguments(scene, SMALL, "volpath"), "sensor": 0, "first": 0}
     arguments |= {"spp": 1, "file": "part.npz"}
