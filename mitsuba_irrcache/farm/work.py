@@ -114,9 +114,10 @@ def frame(arguments: dict, folder: Path) -> None:
     """Render an image; the caches of the last frame are used again where they fit."""
     scene = _loaded(arguments["scene"])
     integrator = scene.integrator()
-    if not getattr(integrator, "depends_on_view", True) and integrator.mapped_medium is None:
-        _prepare(scene)
     sensor, seed, spp = (arguments[name] for name in ("sensor", "seed", "spp"))
+    if not getattr(integrator, "depends_on_view", True) and integrator.mapped_medium is None:
+        if integrator.uses_cache(scene, sensor, spp):
+            _prepare(scene)
     image = np.array(mi.render(scene, sensor=sensor, seed=seed, spp=spp))
     source, parameters = arguments["scene"]["scene"], arguments["scene"]["parameters"]
     about = described(scene, source, sensor, seed, spp) | {"parameters": json.dumps(parameters)}
