@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from uuid import uuid4
+from zipfile import BadZipFile
 
 import mitsuba as mi
 import numpy as np
@@ -36,6 +37,8 @@ from mitsuba_irrcache.out_of_core.slabs import Slab, even_slabs
 #: Pairs of ordinates of a job, at most, and slabs of an axis, about at least: with more of both
 #: more workers have something to do, and reading and writing takes a larger share.
 PAIRS, FEWEST_SLABS = 8, 8
+#: End of the names of files of a `SweepPlan`.
+PLAN = ".plan.npz"
 
 
 @dataclass(frozen=True)
@@ -78,24 +81,28 @@ class SweepPlan:
             "incoming": self.incoming,
             "source": np.frombuffer(self.source.encode(), np.uint8),
         }
-        with atomic_write(folder / f"{self.name}.plan.npz") as file:
+        with atomic_write(folder / f"{self.name}{PLAN}") as file:
             np.savez(file, **arrays)
 
     @classmethod
     def load(cls, folder: Path, name: str) -> SweepPlan:
         """Read a plan that `save` has written."""
-        with np.load(folder / f"{name}.plan.npz", allow_pickle=False) as file:
-            ordinates = tuple(file[key] for key in ("directions", "weights", "offsets"))
-            return cls(
-                name,
-                tuple(map(int, file["shape"])),
-                file["to_world"],
-                float(file["quantum"]),
-                int(file["memory"]),
-                ordinates,
-                file["incoming"],
-                file["source"].tobytes().decode(),
-            )
+        path = folder / f"{name}{PLAN}"
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                ordinates = tuple(file[key] for key in ("directions", "weights", "offsets"))
+                return cls(
+                    name,
+                    tuple(map(int, file["shape"])),
+                    file["to_world"],
+                    float(file["quantum"]),
+                    int(file["memory"]),
+                    ordinates,
+                    file["incoming"],
+                    file["source"].tobytes().decode(),
+                )
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise _unusable(path, str(error)) from None
 
     def sweeps(self, folder: Path) -> list[AxisSweep]:
         """Return the sweeps of all dominant axes, with the files that they read."""
