@@ -44,9 +44,18 @@ class Reference:
 
     @classmethod
     def load(cls, path: Path) -> Reference:
-        """Read a reference that `save` wrote."""
-        with np.load(path, allow_pickle=False) as stored:
-            return cls(stored["a"], stored["b"], int(stored["spp"]), float(stored["seconds"]))
+        """Read a reference that `save` wrote; raise IrrcacheError, naming the file, for any other
+        file.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                a, b, spp, seconds = (stored[name] for name in ("a", "b", "spp", "seconds"))
+                return cls(a, b, int(spp), float(seconds))
+        except Exception as error:  # a damaged file may cause any exception
+            raise IrrcacheError(
+                f'"{path}" is not a readable reference ({error}); delete it, so that it is '
+                "rendered anew."
+            ) from error
 
     def save(self, path: Path) -> None:
         """Write an .npz atomically."""

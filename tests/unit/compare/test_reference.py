@@ -108,6 +108,16 @@ def test_a_changed_file(scene, launches, file):
     assert len(launches) == 2 * count
 
 
+@pytest.mark.parametrize("size", [0, 100, 1000])
+def test_a_damaged_file_is_named(scene, size):
+    folder = scene.parent.parent / "kept"
+    make(scene)
+    (path,) = folder.iterdir()
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(IrrcacheError, match=rf'"{path}" is not a readable reference.*delete it'):
+        make(scene)
+
+
 def test_other_settings(scene, launches):
     """Parameters, integrator and variant are part of what a reference belongs to."""
     make(scene)

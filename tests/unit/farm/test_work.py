@@ -154,7 +154,8 @@ def test_frames_that_need_no_cache_are_rendered_without_one(environment, tmp_pat
     (tmp_path / "found.exr").write_bytes(found.files["frame.exr"])
     expected = np.array(mi.render(scene, spp=1, seed=0))
     assert scene.integrator().cache.samples == 0
-    np.testing.assert_array_equal(read_image(tmp_path / "found.exr"), expected)
+    # Mitsuba's film adds in no fixed order.
+    np.testing.assert_allclose(read_image(tmp_path / "found.exr"), expected, rtol=1e-5)
 
 
 def test_a_worker_that_sees_other_files_says_so(scene, tmp_path):
