@@ -77,6 +77,15 @@ class Job:
         text = json.dumps([*parts, environment.software], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
+    @property
+    def is_current(self) -> bool:
+        """Whether the files of its scene are those that the job was made for."""
+        scene = self.arguments.get("scene")
+        try:
+            return scene is None or contents_of(scene) == scene["contents"]
+        except Exception:  # a changed file may cause any exception of Mitsuba
+            return False
+
 
 def software() -> tuple[tuple[str, str | None], ...]:
     """Return the versions of `SOFTWARE` in this process."""
@@ -96,12 +105,16 @@ def scene_arguments(
 
     The variant has to be set, since Mitsuba's parser finds the files.
     """
-    path, folder = Path(scene).resolve(), os.getcwd()
-    return {
-        "scene": str(path),
+    named = {
+        "scene": str(Path(scene).resolve()),
         "parameters": parameters,
         "integrator": integrator,
-        "folder": folder,
-        "contents": scene_digest(path, parameters, integrator, folder),
-        "variant": mi.variant(),
+        "folder": os.getcwd(),
     }
+    return named | {"contents": contents_of(named), "variant": mi.variant()}
+
+
+def contents_of(scene: dict) -> str:
+    """Return the digest of the files that are named by arguments of a job, as they are now."""
+    names = "parameters", "integrator", "folder"
+    return scene_digest(Path(scene["scene"]), *(scene[name] for name in names))

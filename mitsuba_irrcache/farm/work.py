@@ -19,10 +19,15 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.cli.render import described
 from mitsuba_irrcache.compare.command import measure_integrator
 from mitsuba_irrcache.compare.reference import render_halves
-from mitsuba_irrcache.compare.scene_files import scene_digest
 from mitsuba_irrcache.errors import original_message
 from mitsuba_irrcache.farm import volume_jobs
-from mitsuba_irrcache.farm.jobs import Environment, UnfitWorkerError, difference, software
+from mitsuba_irrcache.farm.jobs import (
+    Environment,
+    UnfitWorkerError,
+    contents_of,
+    difference,
+    software,
+)
 from mitsuba_irrcache.farm.results import Outcome
 from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
@@ -189,11 +194,8 @@ def _check_contents(scene: dict) -> None:
     path = Path(scene["scene"])
     if not path.is_file():
         raise UnfitWorkerError(f'it has no file "{path}"; use a folder that all machines share')
-    arguments = (scene[name] for name in ("parameters", "integrator", "folder"))
-    if scene_digest(path, *arguments) != scene["contents"]:
-        raise UnfitWorkerError(
-            f'the files of "{path}" differ there from those here, or were changed since the start'
-        )
+    if contents_of(scene) != scene["contents"]:
+        raise UnfitWorkerError(f'the files of "{path}" differ there from those here')
 
 
 KINDS = {
