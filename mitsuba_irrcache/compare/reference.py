@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.io.scene_files import load_scene, loses_emission
 
@@ -53,7 +53,7 @@ class Reference:
                 return cls(a, b, int(spp), float(seconds))
         except Exception as error:  # a damaged file may cause any exception
             raise IrrcacheError(
-                f'"{path}" is not a readable reference ({error}); delete it, so that it is '
+                f'"{path}" is not a readable reference ({reason(error)}); delete it, so that it is '
                 "rendered anew."
             ) from error
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mitsuba_irrcache.core.argument_types import whole
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.farm.jobs import SOFTWARE, difference
 from mitsuba_irrcache.machine.doctor import available_cores
 from mitsuba_irrcache.machine.memory import total_memory
@@ -141,8 +141,8 @@ def connected(options: ClusterOptions) -> Iterator[Connection]:
                 client = Client(address, security=security, timeout=PATIENCE)
             except (OSError, ValueError) as error:
                 raise IrrcacheError(
-                    f'no scheduler answers at "{options.scheduler}" ({error}); start one with '
-                    '"dask scheduler", or leave --scheduler out.'
+                    f'no scheduler answers at "{options.scheduler}" ({reason(error)}); start one '
+                    'with "dask scheduler", or leave --scheduler out.'
                 ) from error
             with client:
                 _announce(client)

@@ -20,7 +20,7 @@ from zipfile import BadZipFile
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.farm.jobs import UnfitWorkerError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.io.files import atomic_write
@@ -102,7 +102,7 @@ class SweepPlan:
                     file["source"].tobytes().decode(),
                 )
         except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-            raise _unusable(path, str(error)) from None
+            raise _unusable(path, reason(error)) from None
 
     def sweeps(self, folder: Path) -> list[AxisSweep]:
         """Return the sweeps of all dominant axes, with the files that they read."""
@@ -291,15 +291,15 @@ def _mapped(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     try:
         values = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise _unusable(path, str(error)) from None
+        raise _unusable(path, reason(error)) from None
     if values.shape != tuple(shape) or values.dtype != np.float32:
         raise _unusable(path, f"it has shape {values.shape} of {values.dtype}")
     return values
 
 
-def _unusable(path: Path, reason: str) -> IrrcacheError:
+def _unusable(path: Path, why: str) -> IrrcacheError:
     return IrrcacheError(
-        f'the working file "{path}" cannot be used ({reason}); remove the folder "{path.parent}" '
+        f'the working file "{path}" cannot be used ({why}); remove the folder "{path.parent}" '
         "and start again."
     )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.io.zarr_chunks import check_chunks, is_zarr
 from mitsuba_irrcache.machine.extras import require
 
@@ -56,7 +56,7 @@ class VolumeFile:
         except Exception as error:  # the decoders of Zarr raise exceptions of any type
             raise IrrcacheError(
                 f'irrcache: slices {first} to {last - 1} of "{self.path}" cannot be read '
-                f"({error}); copy or write it again."
+                f"({reason(error)}); copy or write it again."
             ) from error
 
     @property
@@ -107,8 +107,8 @@ class VolumeFile:
             array = zarr.open(str(self.path), mode="r")
         except Exception as error:  # of any type, where the metadata are damaged
             raise IrrcacheError(
-                f'irrcache: "{self.path}" cannot be opened as a Zarr array ({error}); copy or '
-                "write it again."
+                f'irrcache: "{self.path}" cannot be opened as a Zarr array ({reason(error)}); '
+                "copy or write it again."
             ) from error
         if not isinstance(array, zarr.Array):
             raise IrrcacheError(
