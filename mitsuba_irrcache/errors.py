@@ -34,11 +34,12 @@ def suggestion(wanted: str, names: Iterable[str]) -> str:
 
 
 def origin(error: BaseException) -> BaseException:
-    """Return the first exception of the chain of causes.
+    """Return the first exception of the chain of causes, or the last IrrcacheError, whose message
+    is complete.
 
     Mitsuba and Dr.Jit wrap every exception raised by a Python plugin, including KeyboardInterrupt.
     """
-    while error.__cause__ is not None:
+    while error.__cause__ is not None and not isinstance(error, IrrcacheError):
         error = error.__cause__
     return error
 

@@ -70,12 +70,16 @@ def _columns(table: Path) -> dict[str, list[str]]:
         with open(table, newline="", encoding="utf-8-sig") as file:
             lines = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
         head, *rows = lines
+    except UnicodeDecodeError:
+        raise IrrcacheError(f'cannot read the table "{table}": save it as UTF-8.') from None
     except (OSError, ValueError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or "a first row with names is needed"
-        raise IrrcacheError(f'cannot read the table "{table}": {reason}.') from error
+        why = getattr(error, "strerror", None) or "a first row with names is needed"
+        raise IrrcacheError(f'cannot read the table "{table}": {why}.') from error
     for name in head:
         if not name or head.count(name) > 1:
-            found = f'{head.count(name)} columns called "{name}"' if name else "one without a name"
+            found = (
+                f'{head.count(name)} columns called "{name}"' if name else "a column without name"
+            )
             raise IrrcacheError(
                 f'"{table}" has {found}; the first row has to name each column once.'
             )

@@ -70,7 +70,8 @@ def run_job(kind: str, arguments: dict, environment: Environment) -> Outcome:
         except UnfitWorkerError as error:
             return Outcome(worker, unfit=str(error))
         except Exception as error:
-            return Outcome(worker, error=original_message(error) or type(error).__name__)
+            said = original_message(error).removeprefix("irrcache: ") or type(error).__name__
+            return Outcome(worker, error=said)
         files = {
             str(path.relative_to(folder)): path.read_bytes()
             for path in sorted(folder.rglob("*"))

@@ -9,7 +9,13 @@ import pytest
 import mitsuba_irrcache
 from mitsuba_irrcache.cli import render
 from mitsuba_irrcache.cli.main import main
-from mitsuba_irrcache.errors import CacheFileError, IrrcacheError, UnsupportedSceneError, reason
+from mitsuba_irrcache.errors import (
+    CacheFileError,
+    IrrcacheError,
+    UnsupportedSceneError,
+    original_message,
+    reason,
+)
 
 
 @pytest.mark.parametrize(
@@ -28,6 +34,17 @@ def test_errors_of_the_operating_system_have_no_number(error, said, monkeypatch,
     assert main(["render", "scene.xml"]) == 1
     assert capsys.readouterr().err == f"irrcache: error: {said}\n"
     assert said.endswith(reason(error))
+
+
+def test_the_message_of_an_irrcache_error_is_not_that_of_its_cause():
+    """Mitsuba wraps exceptions of plugins, which may have a cause."""
+    try:
+        try:
+            raise IrrcacheError("the file is damaged; delete it") from EOFError("no data")
+        except IrrcacheError as error:
+            raise RuntimeError("a plugin failed") from error
+    except RuntimeError as error:
+        assert original_message(error) == "the file is damaged; delete it"
 
 
 def test_one_except_clause_catches_them_all():
