@@ -175,7 +175,8 @@ def peak_memory() -> int:
 
 
 def _subject(job: dict, integrator: str) -> Subject:
-    return Subject(Path(job["scene"]), job["parameters"], integrator, job["sensor"])
+    folder = job.get("working_folder", "")
+    return Subject(Path(job["scene"]), job["parameters"], integrator, job["sensor"], folder)
 
 
 def _set_up(job: dict) -> None:

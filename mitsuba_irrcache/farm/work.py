@@ -179,6 +179,7 @@ def measurement(arguments: dict, folder: Path) -> None:
     for name in ("measurements", "images", "logs"):
         (folder / name).mkdir()
     job, integrator, name = (arguments[key] for key in ("job", "integrator", "name"))
+    job = job | {"working_folder": arguments["scene"]["folder"]}
     measure_integrator(job, integrator, name, arguments["budgets"], folder)
 
 

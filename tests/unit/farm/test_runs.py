@@ -67,6 +67,7 @@ def copied(folder: Path) -> str:
 
 def measured(job, integrator, name, budgets, folder) -> None:
     """Stand in for `measure_integrator`, which starts several processes."""
+    assert job["working_folder"] == str(Path.cwd())
     write_image(folder / "images" / f"{name}.exr", np.full((8, 8, 3), 0.3, np.float32), {})
     snapshot = Snapshot(budgets[0], {"image": 0.1}, 4, f"images/{name}.exr")
     Measurement(integrator, name, [snapshot]).save(folder / "measurements" / f"{name}.json")
