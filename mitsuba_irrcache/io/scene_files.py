@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.io.scene_xml import scene_element
+from mitsuba_irrcache.io.zarr_chunks import is_zarr
 
 #: Properties that an integrator inherits from one that it replaces, if it has them: those common to
 #: all volumetric path integrators, and the emission of media, which belongs to the scene.
@@ -147,14 +148,34 @@ def check_scene_file(path: str | Path) -> Path:
 def scene_text(
     path: str | Path, parameters: dict[str, str] | None = None, integrator: str | None = None
 ) -> str:
-    """Return the XML of a scene with all $parameters substituted and all includes inlined.
+    """Return the XML of a scene with all $parameters substituted, all includes inlined, and names
+    of files in its ``<path>`` folders relative to its own.
 
     ``integrator`` replaces the scene's integrator as in `load_scene`.
     """
+    folder = Path(path).resolve().parent
     with parsed(path, parameters) as (_, state):
         if integrator is not None:
             replace_integrator(state, integrator)
+        for node in state.nodes:
+            for key in node.props.keys():
+                found = None if key in WRITTEN else _in_path(node.props[key], folder)
+                if found is not None:
+                    node.props[key] = os.path.relpath(found, folder)
         return ElementTree.tostring(scene_element(state), encoding="unicode")
+
+
+def _in_path(name: object, folder: Path) -> Path | None:
+    """Return the file or Zarr folder of this name in the ``<path>`` folders of a parsed scene,
+    which precede its own ``folder``; None if there is none.
+    """
+    for entry in mi.file_resolver() if isinstance(name, str) and name else ():
+        if Path(str(entry)) == folder:
+            return None
+        found = Path(str(entry)) / name
+        if os.path.isfile(found) or (os.path.isdir(found) and is_zarr(found)):
+            return found
+    return None
 
 
 def filled(text: str, integrator: str, parameters: dict[str, str] | None = None) -> str:
