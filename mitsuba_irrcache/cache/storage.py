@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.statistics import BATCH, ORDER_GROUPS, BatchSums
-from mitsuba_irrcache.errors import CacheFileError
+from mitsuba_irrcache.errors import CacheFileError, reason
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.io.files import atomic_write
 
@@ -175,7 +175,7 @@ def _check_values(sums: tuple[np.ndarray, ...], moments: np.ndarray) -> None:
 def unreadable(path: str | Path, error: Exception) -> CacheFileError:
     """Return the error for a file that is damaged or not a cache."""
     return CacheFileError(
-        f'"{path}" is not a readable irradiance cache ({error}); delete it or name another '
+        f'"{path}" is not a readable irradiance cache ({reason(error)}); delete it or name another '
         "cache_file."
     )
 

@@ -332,7 +332,15 @@ class IrradianceCache:
         self._take(part)
 
     def _require_alike(self, other: IrradianceCache, method: str) -> None:
-        """Raise IrrcacheError if ``other`` belongs to another scene or has other settings."""
+        """Raise IrrcacheError unless ``other`` is known to belong to the same scene, and has the
+        same voxels and settings.
+        """
+        if not (self.fingerprint and other.fingerprint):
+            raise IrrcacheError(
+                f"IrradianceCache.{method}: it is not recorded to which scene the "
+                f"{'other ' if self.fingerprint else ''}cache belongs; compute it with the "
+                "property cache_file."
+            )
         for name in differing(self.fingerprint, other.fingerprint):
             raise IrrcacheError(
                 f"IrradianceCache.{method}: the caches belong to different scenes: {name} differs."
@@ -347,6 +355,16 @@ class IrradianceCache:
                 if mine[name] != its[name]
             )
             raise IrrcacheError(f"IrradianceCache.{method}: {differences}.")
+        if other.grid.shared(self.grid) is not self.grid:
+            raise IrrcacheError(
+                f"IrradianceCache.{method}: the grids of the caches are at different places; "
+                "compute both with the same scene."
+            )
+        if not np.array_equal(np.array(self.active), np.array(other.active)):
+            raise IrrcacheError(
+                f"IrradianceCache.{method}: the caches have values in different voxels, "
+                f"{self.active_count} and {other.active_count}; compute both with the same scene."
+            )
 
     def _take(self, other: IrradianceCache) -> None:
         """Add all samples of ``other``."""

@@ -33,9 +33,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if missing is None:
             raise
         message = str(missing)
-    except (IrrcacheError, OSError) as error:
+    except IrrcacheError as error:
         message = str(error)
-    except (KeyboardInterrupt, RuntimeError) as error:  # Mitsuba reports interrupts as errors
+    except (KeyboardInterrupt, RuntimeError, OSError) as error:
+        # Mitsuba reports interrupts as errors.
         if isinstance(origin(error), KeyboardInterrupt):
             what_is_left = f"; {origin(error)}" if str(origin(error)) else ""
             print(f"irrcache: interrupted{what_is_left}", file=sys.stderr)

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.io.scene_files import load_scene, loses_emission
 
@@ -44,9 +44,18 @@ class Reference:
 
     @classmethod
     def load(cls, path: Path) -> Reference:
-        """Read a reference that `save` wrote."""
-        with np.load(path, allow_pickle=False) as stored:
-            return cls(stored["a"], stored["b"], int(stored["spp"]), float(stored["seconds"]))
+        """Read a reference that `save` wrote; raise IrrcacheError, naming the file, for any other
+        file.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                a, b, spp, seconds = (stored[name] for name in ("a", "b", "spp", "seconds"))
+                return cls(a, b, int(spp), float(seconds))
+        except Exception as error:  # a damaged file may cause any exception
+            raise IrrcacheError(
+                f'"{path}" is not a readable reference ({reason(error)}); delete it, so that it is '
+                "rendered anew."
+            ) from error
 
     def save(self, path: Path) -> None:
         """Write an .npz atomically."""
@@ -68,7 +77,8 @@ def reference_path(
     These are all files of the scene, the parameters, the integrator, the sensor, the variant and
     Mitsuba's version.
     """
-    parts = (scene_digest(scene_file, parameters), integrator, sensor, mi.variant(), mi.__version__)
+    inputs = scene_digest(scene_file, parameters, integrator)
+    parts = (inputs, integrator, sensor, mi.variant(), mi.__version__)
     digest = hashlib.sha256(repr(parts).encode()).hexdigest()
     return folder / f"{scene_file.stem}-{digest[:16]}.npz"
 

@@ -56,13 +56,14 @@ Frames = Iterator[tuple[Snapshot, np.ndarray]]
 class Subject:
     """An integrator on a scene, as seen by one sensor.
 
-    ``filter_seconds`` is the duration of the last filtering.
+    ``folder`` is that of `load_scene`; ``filter_seconds`` is the duration of the last filtering.
     """
 
     scene_file: Path
     parameters: dict[str, str]
     integrator: str
     sensor: int = 0
+    folder: str = ""
     launches: int = field(default=0, init=False)
     filter_seconds: float = field(default=0.0, init=False)
 
@@ -82,7 +83,8 @@ class Subject:
 
     def load(self, **properties: object) -> mi.Scene:
         """Load the scene with the integrator and its additional properties."""
-        return load_scene(self.scene_file, self.parameters, self.specification(**properties))
+        specification = self.specification(**properties)
+        return load_scene(self.scene_file, self.parameters, specification, folder=self.folder)
 
     def render(self, scene: mi.Scene, spp: int) -> tuple[np.ndarray, dict[str, float]]:
         """Render an image with a new seed; return it with the seconds by stage."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import json
 import re
+import signal
 import sys
 import time
 from contextlib import suppress
@@ -174,7 +175,8 @@ def peak_memory() -> int:
 
 
 def _subject(job: dict, integrator: str) -> Subject:
-    return Subject(Path(job["scene"]), job["parameters"], integrator, job["sensor"])
+    folder = job.get("working_folder", "")
+    return Subject(Path(job["scene"]), job["parameters"], integrator, job["sensor"], folder)
 
 
 def _set_up(job: dict) -> None:
@@ -197,6 +199,10 @@ KINDS = {"check": check, "reference": make_reference, "measure": measure, "start
 def main() -> int:
     """Run the job; an exception is written to its ``error`` file."""
     job = json.loads(Path(sys.argv[1]).read_text())
+    if hasattr(
+        signal, "pthread_sigmask"
+    ):  # workers of irrcache farm, which may start this, block it
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         _set_up(job)
         job["imported"] = time.time()

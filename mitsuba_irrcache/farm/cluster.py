@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import math
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mitsuba_irrcache.core.argument_types import whole
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.farm.jobs import SOFTWARE, difference
 from mitsuba_irrcache.machine.doctor import available_cores
 from mitsuba_irrcache.machine.memory import total_memory
@@ -133,12 +136,13 @@ def connected(options: ClusterOptions) -> Iterator[Connection]:
     security = _security(options)
     with dask.config.set(_SETTINGS):
         if options.scheduler:
+            address = _address(options.scheduler)
             try:
-                client = Client(**_named(options.scheduler), security=security, timeout=PATIENCE)
+                client = Client(address, security=security, timeout=PATIENCE)
             except (OSError, ValueError) as error:
                 raise IrrcacheError(
-                    f'no scheduler answers at "{options.scheduler}" ({error}); start one with '
-                    '"dask scheduler", or leave --scheduler out.'
+                    f'no scheduler answers at "{options.scheduler}" ({reason(error)}); start one '
+                    'with "dask scheduler", or leave --scheduler out.'
                 ) from error
             with client:
                 _announce(client)
@@ -155,7 +159,7 @@ def _local(options: ClusterOptions, security: Security | None) -> LocalCluster:
     from distributed import LocalCluster
 
     encryption = {"security": security} if security else {}
-    return LocalCluster(
+    cluster = LocalCluster(
         n_workers=0,  # `_refill` starts them, each by itself: one may be killed while it starts
         threads_per_worker=1,
         processes=True,
@@ -166,6 +170,17 @@ def _local(options: ClusterOptions, security: Security | None) -> LocalCluster:
         silence_logs=logging.CRITICAL,
         **encryption,
     )
+    cluster.sync(_block_interrupts)
+    return cluster
+
+
+async def _block_interrupts() -> None:
+    """Leave Ctrl-C to the command: processes started by this thread inherit what it blocks, and
+    would otherwise print tracebacks of their own.
+    """
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        resource_tracker.ensure_running()  # which would end the blocking when the first one starts
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 def _refill(cluster: LocalCluster, count: int) -> None:
@@ -178,12 +193,22 @@ def _refill(cluster: LocalCluster, count: int) -> None:
     cluster.scale(count)
 
 
-def _named(scheduler: str) -> dict[str, str]:
-    if scheduler.endswith(".json"):
-        if not Path(scheduler).is_file():
-            raise IrrcacheError(f'--scheduler: there is no file "{scheduler}".')
-        return {"scheduler_file": scheduler}
-    return {"address": scheduler}
+def _address(scheduler: str) -> str:
+    """Return the address of a scheduler, which a JSON file may contain."""
+    if not scheduler.endswith(".json"):
+        return scheduler
+    if not Path(scheduler).is_file():
+        raise IrrcacheError(f'--scheduler: there is no file "{scheduler}".')
+    try:
+        address = json.loads(Path(scheduler).read_text())["address"]
+    except (OSError, ValueError, KeyError, TypeError):
+        address = None
+    if not isinstance(address, str):
+        raise IrrcacheError(
+            f'--scheduler: "{scheduler}" names no address; name a file that '
+            '"dask scheduler --scheduler-file" has written, or the address itself.'
+        )
+    return address
 
 
 def _security(options: ClusterOptions) -> Security | None:

@@ -251,7 +251,13 @@ class Dispatch:
             return
         if job.name not in self._open:
             return
-        if outcome.unfit:
+        if outcome.unfit and not job.is_current:
+            self._fail(
+                job,
+                "files of its scene were changed since the start; when they are complete, start "
+                "the command again with --resume",
+            )
+        elif outcome.unfit:
             self._exclude(outcome.worker, outcome.unfit)
             self._again(job)
         elif outcome.error:

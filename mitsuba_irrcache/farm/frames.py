@@ -66,20 +66,37 @@ def _values(text: str, values: str, folder: Path) -> list[str]:
 
 def _columns(table: Path) -> dict[str, list[str]]:
     try:
-        with open(table, newline="", encoding="utf-8") as file:
-            head, *rows = [row for row in csv.reader(file) if row]
+        # Spreadsheets write a mark of the encoding before the first name.
+        with open(table, newline="", encoding="utf-8-sig") as file:
+            lines = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
+        head, *rows = lines
+    except UnicodeDecodeError:
+        raise IrrcacheError(f'cannot read the table "{table}": save it as UTF-8.') from None
     except (OSError, ValueError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or "a first row with names is needed"
-        raise IrrcacheError(f'cannot read the table "{table}": {reason}.') from error
+        why = getattr(error, "strerror", None) or "a first row with names is needed"
+        raise IrrcacheError(f'cannot read the table "{table}": {why}.') from error
+    for name in head:
+        if not name or head.count(name) > 1:
+            found = (
+                f'{head.count(name)} columns called "{name}"' if name else "a column without name"
+            )
+            raise IrrcacheError(
+                f'"{table}" has {found}; the first row has to name each column once.'
+            )
     for number, row in enumerate(rows, 2):
         if len(row) != len(head):
             raise IrrcacheError(
                 f'row {number} of "{table}" has {len(row)} values, but the first row names '
                 f"{len(head)}."
             )
+        if "" in row:
+            raise IrrcacheError(
+                f'row {number} of "{table}" has no value for "{head[row.index("")]}"; each row '
+                "needs a value in every column."
+            )
     if not rows:
         raise IrrcacheError(f'"{table}" has no rows of values below the names.')
-    return {name.strip(): [row[i].strip() for row in rows] for i, name in enumerate(head)}
+    return {name: [row[i] for row in rows] for i, name in enumerate(head)}
 
 
 def sensors_of(text: str, available: int) -> list[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -65,16 +66,25 @@ class Job:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of everything that the result depends on; the folder of the scene does not
-        matter, nor does the name of its file.
+        """SHA-256 of everything that the result depends on; the folders of the scene and of other
+        files do not matter, nor does the name of its file.
         """
         environment = self.environment
         scene = self.arguments.get("scene", {})
-        contents = {key: value for key, value in scene.items() if key != "scene"}
+        contents = {key: scene[key] for key in scene if key not in ("scene", "folder")}
         arguments = self.arguments | {"scene": contents}
         parts = [self.kind, arguments, environment.variant, environment.modules]
         text = json.dumps([*parts, environment.software], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the files of its scene are those that the job was made for."""
+        scene = self.arguments.get("scene")
+        try:
+            return scene is None or contents_of(scene) == scene["contents"]
+        except Exception:  # a changed file may cause any exception of Mitsuba
+            return False
 
 
 def software() -> tuple[tuple[str, str | None], ...]:
@@ -90,15 +100,21 @@ def difference(name: str, found: str | None, wanted: str | None) -> str:
 def scene_arguments(
     scene: str | Path, parameters: dict[str, str], integrator: str | None
 ) -> dict[str, object]:
-    """Return the arguments of a job that name a scene, with the digest of its files.
+    """Return the arguments of a job that name a scene, with the digest of its files, and the folder
+    in which relative names of other files are meant.
 
     The variant has to be set, since Mitsuba's parser finds the files.
     """
-    path = Path(scene).resolve()
-    return {
-        "scene": str(path),
+    named = {
+        "scene": str(Path(scene).resolve()),
         "parameters": parameters,
         "integrator": integrator,
-        "contents": scene_digest(path, parameters),
-        "variant": mi.variant(),
+        "folder": os.getcwd(),
     }
+    return named | {"contents": contents_of(named), "variant": mi.variant()}
+
+
+def contents_of(scene: dict) -> str:
+    """Return the digest of the files that are named by arguments of a job, as they are now."""
+    names = "parameters", "integrator", "folder"
+    return scene_digest(Path(scene["scene"]), *(scene[name] for name in names))

@@ -77,13 +77,12 @@ class Results:
 
     def has(self, job: Job) -> bool:
         """Return whether the job has finished with the same inputs, and its files are unchanged."""
+        digest, files = self._known(job)
         try:
-            record = json.loads(self._record(job).read_text())
-            files = record["files"]
-            return record["digest"] == job.digest and all(
+            return digest == job.digest and all(
                 _digest((self.folder / name).read_bytes()) == known for name, known in files.items()
             )
-        except (OSError, ValueError, KeyError):  # no record, or a damaged one
+        except OSError:
             return False
 
     def store(self, job: Job, outcome: Outcome) -> None:
@@ -103,13 +102,20 @@ class Results:
 
     def remove(self, job: Job) -> None:
         """Remove the files of a job and its record."""
-        try:
-            names = json.loads(self._record(job).read_text())["files"]
-        except (OSError, ValueError, KeyError):
-            return
+        _, files = self._known(job)
         self._record(job).unlink(missing_ok=True)
-        for name in names:
+        for name in files:
             (self.folder / name).unlink(missing_ok=True)
+
+    def _known(self, job: Job) -> tuple[str, dict[str, str]]:
+        """Return the digests in the record of a job: of its inputs, "" without a readable record,
+        and of its files by name.
+        """
+        try:
+            record = json.loads(self._record(job).read_text())
+            return str(record["digest"]), dict(record["files"])
+        except (OSError, ValueError, KeyError, TypeError):  # no record, or a damaged one
+            return "", {}
 
     def _record(self, job: Job) -> Path:
         return self._records / f"{job.name}.json"

@@ -111,7 +111,8 @@ def run_reference(args: argparse.Namespace) -> int:
         status = _dispatch(options, reference.missing, reference.store)
     finally:
         reference.finish()
-    print(f"{2 * reference.found.spp} samples per pixel in two halves, {reference.path}")
+    if reference.found is not None:
+        print(f"{2 * reference.found.spp} samples per pixel in two halves, {reference.path}")
     return status
 
 
@@ -119,23 +120,27 @@ def run_study(args: argparse.Namespace) -> int:
     """Measure all integrators on all scenes, and write a report for each scene."""
     options, environment = _begin(args, most_workers=1)
     integrators_of(args)
-    budgets, studies, stores = budgets_of(args.budget), {}, {}
+    budgets, studies, references = budgets_of(args.budget), {}, {}
     Path(args.output).mkdir(exist_ok=True)
     jobs: list[Job] = []
+    stores: dict[str, Store] = {}  # by names of jobs
     for own in arguments_by_scene(args):
         job = common_job(own)
         study = SceneStudy(own, job, budgets, environment)
         missing = study.begin(args.resume)
-        where = Path(job["scene"]), job["parameters"]
-        reference = _reference(args, *where, environment)
-        studies[study] = reference
-        stores |= {each.name: reference.store for each in reference.missing}
+        reference = _reference(args, Path(job["scene"]), job["parameters"], environment)
+        # Scenes with the same contents have the same reference.
+        studies[study] = references.setdefault(reference.path, reference)
         stores |= {each.name: study.store for each in missing}
-        jobs = [*reference.missing, *jobs, *missing]
+        jobs += missing
+    for reference in references.values():
+        stores |= {each.name: reference.store for each in reference.missing}
+        jobs = [*reference.missing, *jobs]
     try:
         status = _dispatch(options, jobs, lambda job, outcome: stores[job.name](job, outcome))
     finally:
-        complete = {study for study, reference in studies.items() if reference.finish()}
+        finished = {path: reference.finish() for path, reference in references.items()}
+    complete = [study for study, reference in studies.items() if finished[reference.path]]
     for study in complete:
         print(f"report {study.report(studies[study].found)}")
         for measurement in study.measurements:

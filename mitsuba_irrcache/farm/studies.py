@@ -6,6 +6,7 @@ import argparse
 import copy
 import tempfile
 from collections import Counter
+from functools import cached_property
 from pathlib import Path
 
 from mitsuba_irrcache.compare.command import write_report
@@ -43,17 +44,14 @@ class SceneStudy:
             wanted = self._job | {"integrators": [*self._args.integrator, self._args.reference]}
             files = Path(scratch) / "checked.json", Path(scratch) / "log"
             self._checked = run_job("check", wanted, *files)
-        failed = {measurement.name for measurement in self.measurements if measurement.error}
-        return [
-            job
-            for job in self._jobs()
-            if job.arguments["name"] in failed or not self._results.has(job)
-        ]
+        good = {measurement.name for measurement in self.measurements if not measurement.error}
+        return [job for job in self._jobs if job.arguments["name"] not in good]
 
+    @cached_property
     def _jobs(self) -> list[Job]:
-        scene = scene_arguments(self._job["scene"], self._job["parameters"], None)
-        jobs = []
+        where, jobs = (self._job["scene"], self._job["parameters"]), []
         for number, integrator in enumerate(self._args.integrator):
+            scene = scene_arguments(*where, integrator)
             name = file_name(number, integrator)
             own = {"scene": scene, "job": self._job, "integrator": integrator, "name": name}
             own["budgets"] = self._budgets
@@ -67,9 +65,8 @@ class SceneStudy:
     @property
     def measurements(self) -> list[Measurement]:
         """Return the finished measurements, some of which may hold an error."""
-        names = [file_name(n, i) for n, i in enumerate(self._args.integrator)]
-        files = [self._folder / "measurements" / f"{name}.json" for name in names]
-        return [Measurement.load(file) for file in files if file.exists()]
+        names = [job.arguments["name"] for job in self._jobs if self._results.has(job)]
+        return [Measurement.load(self._folder / "measurements" / f"{name}.json") for name in names]
 
     def report(self, reference: Reference) -> Path:
         """Write the report of all finished measurements; return its file."""

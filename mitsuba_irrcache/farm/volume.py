@@ -19,6 +19,7 @@ from mitsuba_irrcache.farm.results import Outcome, Results
 from mitsuba_irrcache.farm.volume_jobs import (
     FEWEST_SLABS,
     PAIRS,
+    PLAN,
     SweepPlan,
     by_length_of_way,
     slices_of,
@@ -35,7 +36,7 @@ class FarmSweep(SlabSweep):
     see; ``memory`` is that of each worker.
 
     Finished jobs are kept there: with the same ``inputs``, the digest of all that the irradiance
-    depends on, a later run continues.
+    depends on, a later run continues. It has the slabs of the first run, whatever its ``memory``.
     """
 
     def __init__(
@@ -48,13 +49,13 @@ class FarmSweep(SlabSweep):
         inputs: str,
     ) -> None:
         self._connection, self._environment = connection, environment
-        settings = [inputs, memory, PAIRS, FEWEST_SLABS, environment.variant, environment.software]
+        settings = [inputs, PAIRS, FEWEST_SLABS, environment.variant, environment.software]
         # Nothing is read that workers of an earlier run, of other inputs, may still be writing.
         own = folder.resolve() / hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16]
         self._results = Results(own, "finished")
         folder.mkdir(exist_ok=True)
         self._results.begin(resume=True)
-        super().__init__(sigma_t, own, memory)
+        super().__init__(sigma_t, own, _memory_of_first_run(own, memory))
 
     def file(self, name: str, dtype: np.dtype = np.float32, channels: int = 1) -> BrickFile:
         """Create or open a working file for values of all voxels."""
@@ -132,3 +133,10 @@ class FarmSweep(SlabSweep):
             name = f"{plan.name}-slices-{first}-{end - 1}"
             jobs.append(Job(name, "add_axes", arguments, self._environment, last))
         return jobs, {step.name: step.reads for step in steps}
+
+
+def _memory_of_first_run(folder: Path, memory: int) -> int:
+    """Return the memory for which an earlier run has chosen its slabs; ``memory`` without one."""
+    for file in folder.glob(f"*{PLAN}"):
+        return SweepPlan.load(folder, file.name.removesuffix(PLAN)).memory
+    return memory

@@ -15,11 +15,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from uuid import uuid4
+from zipfile import BadZipFile
 
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.farm.jobs import UnfitWorkerError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.io.files import atomic_write
@@ -36,6 +37,8 @@ from mitsuba_irrcache.out_of_core.slabs import Slab, even_slabs
 #: Pairs of ordinates of a job, at most, and slabs of an axis, about at least: with more of both
 #: more workers have something to do, and reading and writing takes a larger share.
 PAIRS, FEWEST_SLABS = 8, 8
+#: End of the names of files of a `SweepPlan`.
+PLAN = ".plan.npz"
 
 
 @dataclass(frozen=True)
@@ -78,24 +81,28 @@ class SweepPlan:
             "incoming": self.incoming,
             "source": np.frombuffer(self.source.encode(), np.uint8),
         }
-        with atomic_write(folder / f"{self.name}.plan.npz") as file:
+        with atomic_write(folder / f"{self.name}{PLAN}") as file:
             np.savez(file, **arrays)
 
     @classmethod
     def load(cls, folder: Path, name: str) -> SweepPlan:
         """Read a plan that `save` has written."""
-        with np.load(folder / f"{name}.plan.npz", allow_pickle=False) as file:
-            ordinates = tuple(file[key] for key in ("directions", "weights", "offsets"))
-            return cls(
-                name,
-                tuple(map(int, file["shape"])),
-                file["to_world"],
-                float(file["quantum"]),
-                int(file["memory"]),
-                ordinates,
-                file["incoming"],
-                file["source"].tobytes().decode(),
-            )
+        path = folder / f"{name}{PLAN}"
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                ordinates = tuple(file[key] for key in ("directions", "weights", "offsets"))
+                return cls(
+                    name,
+                    tuple(map(int, file["shape"])),
+                    file["to_world"],
+                    float(file["quantum"]),
+                    int(file["memory"]),
+                    ordinates,
+                    file["incoming"],
+                    file["source"].tobytes().decode(),
+                )
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise _unusable(path, reason(error)) from None
 
     def sweeps(self, folder: Path) -> list[AxisSweep]:
         """Return the sweeps of all dominant axes, with the files that they read."""
@@ -284,15 +291,15 @@ def _mapped(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     try:
         values = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise _unusable(path, str(error)) from None
+        raise _unusable(path, reason(error)) from None
     if values.shape != tuple(shape) or values.dtype != np.float32:
         raise _unusable(path, f"it has shape {values.shape} of {values.dtype}")
     return values
 
 
-def _unusable(path: Path, reason: str) -> IrrcacheError:
+def _unusable(path: Path, why: str) -> IrrcacheError:
     return IrrcacheError(
-        f'the working file "{path}" cannot be used ({reason}); remove the folder "{path.parent}" '
+        f'the working file "{path}" cannot be used ({why}); remove the folder "{path.parent}" '
         "and start again."
     )
 

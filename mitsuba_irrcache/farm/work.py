@@ -19,10 +19,15 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.cli.render import described
 from mitsuba_irrcache.compare.command import measure_integrator
 from mitsuba_irrcache.compare.reference import render_halves
-from mitsuba_irrcache.compare.scene_files import scene_digest
 from mitsuba_irrcache.errors import original_message
 from mitsuba_irrcache.farm import volume_jobs
-from mitsuba_irrcache.farm.jobs import Environment, UnfitWorkerError, difference, software
+from mitsuba_irrcache.farm.jobs import (
+    Environment,
+    UnfitWorkerError,
+    contents_of,
+    difference,
+    software,
+)
 from mitsuba_irrcache.farm.results import Outcome
 from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
@@ -65,7 +70,8 @@ def run_job(kind: str, arguments: dict, environment: Environment) -> Outcome:
         except UnfitWorkerError as error:
             return Outcome(worker, unfit=str(error))
         except Exception as error:
-            return Outcome(worker, error=original_message(error) or type(error).__name__)
+            said = original_message(error).removeprefix("irrcache: ") or type(error).__name__
+            return Outcome(worker, error=said)
         files = {
             str(path.relative_to(folder)): path.read_bytes()
             for path in sorted(folder.rglob("*"))
@@ -114,9 +120,10 @@ def frame(arguments: dict, folder: Path) -> None:
     """Render an image; the caches of the last frame are used again where they fit."""
     scene = _loaded(arguments["scene"])
     integrator = scene.integrator()
-    if not getattr(integrator, "depends_on_view", True) and integrator.mapped_medium is None:
-        _prepare(scene)
     sensor, seed, spp = (arguments[name] for name in ("sensor", "seed", "spp"))
+    if not getattr(integrator, "depends_on_view", True) and integrator.mapped_medium is None:
+        if integrator.uses_cache(scene, sensor, spp):
+            _prepare(scene)
     image = np.array(mi.render(scene, sensor=sensor, seed=seed, spp=spp))
     source, parameters = arguments["scene"]["scene"], arguments["scene"]["parameters"]
     about = described(scene, source, sensor, seed, spp) | {"parameters": json.dumps(parameters)}
@@ -172,13 +179,16 @@ def measurement(arguments: dict, folder: Path) -> None:
     for name in ("measurements", "images", "logs"):
         (folder / name).mkdir()
     job, integrator, name = (arguments[key] for key in ("job", "integrator", "name"))
+    job = job | {"working_folder": arguments["scene"]["folder"]}
     measure_integrator(job, integrator, name, arguments["budgets"], folder)
 
 
 def _loaded(scene: dict) -> mi.Scene:
     """Load the scene of a job."""
     _check_contents(scene)
-    return load_scene(scene["scene"], scene["parameters"], scene["integrator"])
+    names = "scene", "parameters", "integrator", "folder"
+    path, parameters, integrator, folder = (scene[name] for name in names)
+    return load_scene(path, parameters, integrator, folder=folder)
 
 
 def _check_contents(scene: dict) -> None:
@@ -186,10 +196,8 @@ def _check_contents(scene: dict) -> None:
     path = Path(scene["scene"])
     if not path.is_file():
         raise UnfitWorkerError(f'it has no file "{path}"; use a folder that all machines share')
-    if scene_digest(path, scene["parameters"]) != scene["contents"]:
-        raise UnfitWorkerError(
-            f'the files of "{path}" differ there from those here, or were changed since the start'
-        )
+    if contents_of(scene) != scene["contents"]:
+        raise UnfitWorkerError(f'the files of "{path}" differ there from those here')
 
 
 KINDS = {

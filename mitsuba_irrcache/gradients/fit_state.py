@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.io.files import atomic_write
 
 #: Radiance below which errors of the loss ``relative`` are absolute.
@@ -123,7 +123,7 @@ class Result:
             about = json.loads(str(arrays.pop("about")))
             history = [(int(s), a, b) for s, a, b in arrays.pop("history").tolist()]
         except (OSError, ValueError, KeyError) as error:
-            raise IrrcacheError(f'"{path}" is no checkpoint of a fit: {error}.') from error
+            raise IrrcacheError(f'"{path}" is no checkpoint of a fit: {reason(error)}.') from error
         others = {k: v for k, v in about["settings"].items() if asdict(settings)[k] != v}
         if others:
             raise IrrcacheError(

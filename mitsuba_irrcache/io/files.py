@@ -51,6 +51,21 @@ def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
         raise
 
 
+def check_folder_of(file: Path, name: str) -> None:
+    """Raise IrrcacheError if the folder of a file cannot be written to; ``name`` is that of the
+    property which names the file.
+    """
+    if not os.path.isdir(file.parent):  # returns False where Path.is_dir may raise
+        raise IrrcacheError(
+            f'irrcache: {name} "{file}": the folder "{file.parent}" does not exist.'
+        )
+    if not os.access(file.parent, os.W_OK | os.X_OK):
+        raise IrrcacheError(
+            f'irrcache: {name} "{file}": nothing can be written to the folder "{file.parent}"; '
+            "name another one."
+        )
+
+
 def _remove_abandoned(folder: Path, prefix: str, suffix: str) -> None:
     """Remove temporary files with this name that are no longer being written."""
     with suppress(OSError):

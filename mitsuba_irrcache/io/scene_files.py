@@ -14,11 +14,14 @@ import mitsuba as mi
 
 from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.io.scene_xml import scene_element
+from mitsuba_irrcache.io.zarr_chunks import is_zarr
 
 #: Properties that an integrator inherits from one that it replaces, if it has them: those common to
 #: all volumetric path integrators, and the emission of media, which belongs to the scene.
 SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters", "emission", "emission_scale")
-
+#: Properties that name what an integrator writes. Files with these names that exist already are
+#: read only where they belong to the same scene and settings.
+WRITTEN = ("cache_file", "irradiance_file", "work_folder")
 
 #: A list item: text without commas, except inside quotes.
 _ITEM = r"""(?:[^,"']|"[^"]*"|'[^']*')+"""
@@ -29,24 +32,49 @@ def load_scene(
     parameters: dict[str, str] | None = None,
     integrator: str | None = None,
     properties: dict[str, object] | None = None,
+    folder: str | Path = "",
 ) -> mi.Scene:
     """Load a scene XML with ``$parameters``, optionally replacing its integrator.
 
     ``integrator`` is a specification such as ``irrcache{step=0.5}``. The `SHARED_PROPERTIES` of the
     scene's own integrator are preserved unless the specification sets them or the new plugin does
-    not support them. ``properties`` are set in addition to those that the integrator has. Raises
-    IrrcacheError if the file is missing.
+    not support them. ``properties`` are set in addition to those that the integrator has.
+    ``folder`` is that of relative names of files that are not beside the scene, and of those that
+    the integrator writes; "": the working folder. Raises IrrcacheError if the file is missing.
     """
-    path = Path(path)
-    config, state = _parse(path, parameters)
-    with _explained(path), _search_path(path.parent):
+    with parsed(path, parameters, folder) as (config, state):
         mi.parser.transform_all(config, state)
         if integrator is not None:
-            _replace_integrator(state, integrator)
+            replace_integrator(state, integrator)
         for key, value in (properties or {}).items():
             _integrator_node(state).props[key] = value
+        _place_written_files(state, folder)
         scene = mi.parser.instantiate(config, state)
     return scene[0] if isinstance(scene, list) else scene
+
+
+@contextmanager
+def parsed(
+    path: str | Path, parameters: dict[str, str] | None = None, folder: str | Path = ""
+) -> Iterator[tuple[mi.parser.ParserConfig, mi.parser.ParserState]]:
+    """Parse a scene XML, and search for files within this context as `load_scene` does: in the
+    scene's ``<path>`` folders, beside it, and in ``folder``.
+    """
+    path = check_scene_file(path)
+    config = mi.parser.ParserConfig(mi.variant())
+    with _explained(path), _search_path(folder, path.parent):
+        yield config, mi.parser.parse_file(config, str(path), **(parameters or {}))
+
+
+def _place_written_files(state: mi.parser.ParserState, folder: str | Path) -> None:
+    """Make relative names of files that integrators write those of files in ``folder``."""
+    for node in state.nodes:
+        if node.type != mi.ObjectType.Integrator:
+            continue
+        for key in WRITTEN:
+            name = node.props.get(key, None)
+            if isinstance(name, str) and name:
+                node.props[key] = str(Path(folder) / name)
 
 
 @contextmanager
@@ -120,22 +148,41 @@ def check_scene_file(path: str | Path) -> Path:
 def scene_text(
     path: str | Path, parameters: dict[str, str] | None = None, integrator: str | None = None
 ) -> str:
-    """Return the XML of a scene with all $parameters substituted and all includes inlined.
+    """Return the XML of a scene with all $parameters substituted, all includes inlined, and names
+    of files in its ``<path>`` folders relative to its own.
 
     ``integrator`` replaces the scene's integrator as in `load_scene`.
     """
-    path = Path(path)
-    _, state = _parse(path, parameters)
-    if integrator is not None:
-        _replace_integrator(state, integrator)
-    return ElementTree.tostring(scene_element(state), encoding="unicode")
+    folder = Path(path).resolve().parent
+    with parsed(path, parameters) as (_, state):
+        if integrator is not None:
+            replace_integrator(state, integrator)
+        for node in state.nodes:
+            for key in node.props.keys():
+                found = None if key in WRITTEN else _in_path(node.props[key], folder)
+                if found is not None:
+                    node.props[key] = os.path.relpath(found, folder)
+        return ElementTree.tostring(scene_element(state), encoding="unicode")
+
+
+def _in_path(name: object, folder: Path) -> Path | None:
+    """Return the file or Zarr folder of this name in the ``<path>`` folders of a parsed scene,
+    which precede its own ``folder``; None if there is none.
+    """
+    for entry in mi.file_resolver() if isinstance(name, str) and name else ():
+        if Path(str(entry)) == folder:
+            return None
+        found = Path(str(entry)) / name
+        if os.path.isfile(found) or (os.path.isdir(found) and is_zarr(found)):
+            return found
+    return None
 
 
 def filled(text: str, integrator: str, parameters: dict[str, str] | None = None) -> str:
     """Apply the transformations of `scene_text` to an XML string."""
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_string(config, text, **(parameters or {}))
-    _replace_integrator(state, integrator)
+    replace_integrator(state, integrator)
     return ElementTree.tostring(scene_element(state), encoding="unicode")
 
 
@@ -161,19 +208,20 @@ def scene_of_text(
 
 def integrator_of(path: str | Path, parameters: dict[str, str] | None = None) -> str:
     """Return the integrator plugin named in a scene file, or "path", Mitsuba's default."""
-    _, state = _parse(Path(path), parameters)
-    node = _integrator_node(state)
-    return "path" if node is None else node.props.plugin_name()
+    with parsed(path, parameters) as (_, state):
+        node = _integrator_node(state)
+        return "path" if node is None else node.props.plugin_name()
 
 
 def loses_emission(path: str | Path, parameters: dict[str, str] | None, integrator: str) -> bool:
     """Return whether media of a scene emit, but would not with another integrator."""
-    _, state = _parse(Path(path), parameters)
-    node = _integrator_node(state)
-    if node is None or "emission" not in node.props or node.props.get("emission_scale", 1.0) == 0:
-        return False
-    _replace_integrator(state, integrator)
-    return "emission" not in node.props
+    with parsed(path, parameters) as (_, state):
+        node = _integrator_node(state)
+        emits = node is not None and "emission" in node.props
+        if not emits or node.props.get("emission_scale", 1.0) == 0:
+            return False
+        replace_integrator(state, integrator)
+        return "emission" not in node.props
 
 
 def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
@@ -240,15 +288,6 @@ def _quoted(value: object) -> str:
     return f"'{text}'" if "," in text else text
 
 
-def _parse(
-    path: Path, parameters: dict[str, str] | None
-) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
-    check_scene_file(path)
-    config = mi.parser.ParserConfig(mi.variant())
-    with _explained(path):
-        return config, mi.parser.parse_file(config, str(path), **(parameters or {}))
-
-
 def _literal(text: str) -> object:
     if text in ("true", "false"):
         return text == "true"
@@ -275,7 +314,8 @@ def _add_integrator(state: mi.parser.ParserState) -> mi.parser.SceneNode:
     return state.nodes[number]
 
 
-def _replace_integrator(state: mi.parser.ParserState, specification: str) -> None:
+def replace_integrator(state: mi.parser.ParserState, specification: str) -> None:
+    """Replace the integrator of a parsed scene as `load_scene` does."""
     name, properties = parse_integrator(specification)
     node = _integrator_node(state) or _add_integrator(state)
     inherited = {k: node.props[k] for k in SHARED_PROPERTIES if k in node.props}
@@ -288,20 +328,18 @@ def _replace_integrator(state: mi.parser.ParserState, specification: str) -> Non
         node.props[key] = value
 
 
-class _search_path:  # noqa: N801 (a context manager)
-    """Make Mitsuba resolve file names relative to the folder of the scene."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = str(folder.resolve())
-
-    def __enter__(self) -> None:
-        self.saved = mi.file_resolver()
-        resolver = mi.FileResolver(self.saved)
-        resolver.prepend(self.folder)
-        mi.set_file_resolver(resolver)
-
-    def __exit__(self, *_: object) -> None:
-        mi.set_file_resolver(self.saved)
+@contextmanager
+def _search_path(*folders: str | Path) -> Iterator[None]:
+    """Make Mitsuba search for files in these folders, too, the last one first."""
+    saved = mi.file_resolver()
+    resolver = mi.FileResolver(saved)
+    for folder in folders:
+        resolver.prepend(str(Path(folder).resolve()))
+    mi.set_file_resolver(resolver)
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(saved)
 
 
 def has_cache(scene: mi.Scene) -> bool:

@@ -1,4 +1,4 @@
-"""Completeness of the chunks of a Zarr array in a folder, which the library does not check.
+"""Folders of Zarr arrays: which ones are, and whether all of their chunks are complete.
 
 Blosc unpacks a chunk whose end is missing without an error, and a chunk whose file is absent or
 empty counts as the fill value: writers leave out chunks that hold nothing else.
@@ -17,9 +17,16 @@ from mitsuba_irrcache.errors import IrrcacheError
 if TYPE_CHECKING:
     import zarr
 
+#: Names of the file in the folder of a Zarr array, of version 3 and 2 of the format.
+_MARKS = ("zarr.json", ".zarray")
 _METADATA = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
 #: Blosc's header: versions, flags, item size, sizes unpacked, of a block, and packed.
 _BLOSC = struct.Struct("<4B3I")
+
+
+def is_zarr(folder: Path) -> bool:
+    """Return whether a folder holds a Zarr array."""
+    return any((folder / mark).is_file() for mark in _MARKS)
 
 
 def check_chunks(source: str, folder: str | os.PathLike, array: zarr.Array) -> int:

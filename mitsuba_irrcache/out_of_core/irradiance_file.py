@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.io.files import atomic_write
+from mitsuba_irrcache.io.files import atomic_write, check_folder_of
 from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
 from mitsuba_irrcache.out_of_core.slabs import even_slabs
 
@@ -18,23 +19,36 @@ from mitsuba_irrcache.out_of_core.slabs import even_slabs
 class IrradianceFile:
     """Irradiance that was written by `write`: float32 (z, y, x, channel).
 
-    With ``is_grey`` all channels are equal, and the first one is read.
+    With ``is_grey`` all channels are equal, and the first one is read. The file stays open: where
+    another one replaces it, the values remain those of this one.
     """
 
     def __init__(self, path: Path, is_grey: bool) -> None:
-        self._path = path
-        *self.shape, channels = np.load(path, mmap_mode="r", allow_pickle=False).shape
+        self._path, self._file = path, open(path, "rb")
+        self.close = weakref.finalize(self, self._file.close)
+        np.lib.format.read_magic(self._file)
+        self._shape, *_ = np.lib.format.read_array_header_1_0(self._file)
+        self._offset = self._file.tell()
+        *self.shape, channels = self._shape
         self.channels = 1 if is_grey else channels
+        #: size and time of the file
+        self.state = _state(self._file.fileno())
 
     def read(self, lower: Sequence[int], upper: Sequence[int]) -> np.ndarray:
-        """Return the values (z, y, x[, channel]) of a box between two corners (z, y, x)."""
-        # Opened anew each time, as pages of a mapped file count as memory of the process.
-        mapped = np.load(self._path, mmap_mode="r", allow_pickle=False)
-        box = mapped[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))]
-        return np.array(box[..., 0] if self.channels == 1 else box)
+        """Return the values (z, y, x[, channel]) of a box between two corners (z, y, x).
 
-    def close(self) -> None:
-        """Do nothing, since the file belongs to the user."""
+        Raises IrrcacheError if another program has written to the file since it was opened.
+        """
+        # Mapped anew each time, as pages of a mapped file count as memory of the process.
+        mapped = np.memmap(self._file, "<f4", "r", self._offset, self._shape)
+        box = mapped[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))]
+        values = np.array(box[..., 0] if self.channels == 1 else box)
+        if _state(self._file.fileno()) != self.state:
+            raise IrrcacheError(
+                f'irrcache: irradiance_file "{self._path}" was changed while it was in use; load '
+                "the scene again, which computes the irradiance anew."
+            )
+        return values
 
 
 def write(path: Path, irradiance: BrickFile, colour: np.ndarray, inputs: str) -> None:
@@ -61,9 +75,11 @@ def write(path: Path, irradiance: BrickFile, colour: np.ndarray, inputs: str) ->
 
 
 def check_replaceable(path: Path) -> None:
-    """Raise IrrcacheError if ``path`` is a file that `write` cannot have written, such as a volume:
-    it has no record, which an interruption may also cause, and holds no irradiance (z, y, x, c).
+    """Raise IrrcacheError if ``path`` cannot be written, or is a file that `write` cannot have
+    written, such as a volume: it has no record, which an interruption may also cause, and holds no
+    irradiance (z, y, x, c).
     """
+    check_folder_of(path, "irradiance_file")
     if not path.exists():
         return
     try:
@@ -87,8 +103,11 @@ def recorded(path: Path, inputs: str) -> IrradianceFile | None:
     """Open the file if it was computed from these ``inputs`` and has not been changed since."""
     try:
         record = json.loads(_record(path).read_text())
-        if record["inputs"] == inputs and record["file"] == _state(path):
-            return IrradianceFile(path, record["is_grey"])
+        if record["inputs"] == inputs:
+            file = IrradianceFile(path, record["is_grey"])
+            if file.state == record["file"]:
+                return file
+            file.close()
     except (OSError, ValueError, KeyError, TypeError):  # no file, or a damaged one
         pass
     return None
@@ -98,7 +117,7 @@ def _record(path: Path) -> Path:
     return path.with_name(f"{path.name}.json")
 
 
-def _state(file: Path | int) -> list[int]:
-    """Return the size and time of a file, given its path or descriptor."""
-    state = os.stat(file)
+def _state(file: int) -> list[int]:
+    """Return the size and time of a file, given its descriptor."""
+    state = os.fstat(file)
     return [state.st_size, state.st_mtime_ns]

@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.io.zarr_chunks import check_chunks
+from mitsuba_irrcache.errors import IrrcacheError, reason
+from mitsuba_irrcache.io.zarr_chunks import check_chunks, is_zarr
 from mitsuba_irrcache.machine.extras import require
 
 #: Names of raw files, with sizes along x, y, z and type, as in the Open SciVis data sets.
 RAW_NAME = re.compile(r"_(\d+)x(\d+)x(\d+)_(u?int(?:8|16|32)|float(?:16|32|64))\.raw$")
-#: Names of the file in the folder of a Zarr array, of version 3 and 2 of the format.
-ZARR_MARKS = ("zarr.json", ".zarray")
 
 
 class VolumeFile:
@@ -58,7 +56,7 @@ class VolumeFile:
         except Exception as error:  # the decoders of Zarr raise exceptions of any type
             raise IrrcacheError(
                 f'irrcache: slices {first} to {last - 1} of "{self.path}" cannot be read '
-                f"({error}); copy or write it again."
+                f"({reason(error)}); copy or write it again."
             ) from error
 
     @property
@@ -72,7 +70,7 @@ class VolumeFile:
         return [(name, s.st_size, s.st_mtime_ns, s.st_ino) for name, s in known]
 
     def _opener(self) -> Callable:
-        if any((self.path / mark).is_file() for mark in ZARR_MARKS):
+        if is_zarr(self.path):
             return self._zarr
         if self.path.suffix.lower() == ".npy":
             return self._npy
@@ -109,8 +107,8 @@ class VolumeFile:
             array = zarr.open(str(self.path), mode="r")
         except Exception as error:  # of any type, where the metadata are damaged
             raise IrrcacheError(
-                f'irrcache: "{self.path}" cannot be opened as a Zarr array ({error}); copy or '
-                "write it again."
+                f'irrcache: "{self.path}" cannot be opened as a Zarr array ({reason(error)}); '
+                "copy or write it again."
             ) from error
         if not isinstance(array, zarr.Array):
             raise IrrcacheError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.core import properties
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.files import check_folder_of
 from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
 
 
@@ -54,6 +56,8 @@ def check_settings(settings: CacheSettings, files: VolumeSettings, whole: bool) 
         raise IrrcacheError(
             f'irrcache: irradiance_file is "{files.irradiance}"; its name must end with .npy.'
         )
+    if files.irradiance and not os.path.exists(files.irradiance):
+        check_folder_of(Path(files.irradiance), "irradiance_file")
     wrong = ""
     if settings.max_depth not in (-1, 2):
         wrong = (

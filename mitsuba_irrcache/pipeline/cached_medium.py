@@ -28,6 +28,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
+from mitsuba_irrcache.io.files import check_folder_of
 from mitsuba_irrcache.lights.emitters import EmitterKind, position_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.lights.narrow_sources import MAX_LAMPS, sources_of
@@ -399,15 +400,7 @@ class CachedMedium:
         """
         file = Path(self.file)
         if not os.path.exists(file):  # returns False where Path.exists may raise
-            if not os.path.isdir(file.parent):
-                raise IrrcacheError(
-                    f'irrcache: cache_file "{file}": the folder "{file.parent}" does not exist.'
-                )
-            if not os.access(file.parent, os.W_OK | os.X_OK):
-                raise IrrcacheError(
-                    f'irrcache: cache_file "{file}": nothing can be written to the folder '
-                    f'"{file.parent}"; name another one.'
-                )
+            check_folder_of(file, "cache_file")
             return cache
         stored = IrradianceCache.load(file, cache.interpolation)
         others = differing(cache.fingerprint, stored.fingerprint)

@@ -47,13 +47,15 @@ class _Collector(IrradianceCache):
 
 def missing_parts(cached: CachedMedium) -> Iterator[tuple[int, int]]:
     """Yield (index of the first batch, number of batches) of each part that the cache of a medium
-    lacks to have the samples of its settings.
+    lacks to have the samples of its settings. They continue the stream of its own seed, whatever
+    the seeds of the samples that are there.
     """
     cache = cached.cache
     at_once = cached.solver.batches_at_once(cache)
-    last = cached.target(cached.settings.samples) // cache.batch
-    for first in range(cache.samples // cache.batch, last, at_once):
-        yield first, min(at_once, last - first)
+    begin = cache.streams.get(cached.settings.seed, 0) // cache.batch
+    missing = (cached.target(cached.settings.samples) - cache.samples) // cache.batch
+    for first in range(begin, begin + missing, at_once):
+        yield first, min(at_once, begin + missing - first)
 
 
 class StreamParts:

@@ -16,7 +16,7 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, reason
 
 LOCAL = ("localhost", "127.0.0.1", "::1")
 
@@ -177,8 +177,9 @@ def check_host(host: str) -> None:
                 trial.bind(address)
     except (OSError, UnicodeError) as error:
         raise IrrcacheError(
-            f'--host is "{host}", where this machine cannot listen ({error}); give 127.0.0.1 for '
-            "this machine alone, 0.0.0.0 for all its networks, or one of its own addresses."
+            f'--host is "{host}", where this machine cannot listen ({reason(error)}); give '
+            "127.0.0.1 for this machine alone, 0.0.0.0 for all its networks, or one of its own "
+            "addresses."
         ) from None
 
 

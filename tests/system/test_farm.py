@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -76,6 +78,30 @@ def test_kills_of_workers_and_of_the_command_leave_no_trace(tmp_path):
     scene = load_scene(SCENE, {}, alone)
     scene.integrator().prepare(scene)
     assert file.read_bytes() == (tmp_path / "alone.cache").read_bytes()
+
+
+#: The command, in which Ctrl-C has its effect also where the tests run in the background.
+COMMAND = """
+import signal, sys
+from mitsuba_irrcache.cli.main import main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_ctrl_c_ends_the_command_with_one_line(tmp_path):
+    """It reaches all processes, of which workers leave it to the command."""
+    arguments = ["farm", "cache", SCENE, "-i", INTEGRATOR, "-o", str(tmp_path / "light.cache")]
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *arguments, "--workers", "2"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+    )  # fmt: skip
+    lines_until(process, 1)
+    os.killpg(process.pid, signal.SIGINT)
+    said = process.communicate()[0]
+    assert process.returncode == 130 and "Traceback" not in said, said
+    last = said.splitlines()[-1]
+    assert "interrupted; " in last and "jobs are finished and kept; --resume continues" in last
 
 
 def test_a_folder_of_other_files_is_refused_and_stays(tmp_path, capsys):

@@ -21,7 +21,12 @@ SCENE = """<scene version="3.0.0"><default name="radiance" value="1"/>
 
 @pytest.mark.parametrize(
     ("wanted", "expected"),
-    [("Solvr", ' (did you mean "solver"?)'), ("blur", ""), ("RESOLUTION", "resolution")],
+    [
+        ("Solvr", ' (did you mean "solver"?)'),
+        ("blur", ""),
+        ("RESOLUTION", "resolution"),
+        ("solver", ""),
+    ],
 )
 def test_most_similar_name(wanted, expected):
     assert expected in suggestion(wanted, ["solver", "resolution"])
@@ -62,6 +67,14 @@ def test_misspelt_names_of_a_scene(tmp_path, capsys, integrator, name, options, 
     scene.write_text(SCENE.format(integrator=integrator, name=name))
     assert main(["render", str(scene), *options]) == 1
     assert f'did you mean "{meant}"?' in capsys.readouterr().err
+
+
+def test_a_name_that_has_no_meaning_here_is_not_suggested(tmp_path, capsys):
+    scene = tmp_path / "scene.xml"
+    scene.write_text(SCENE.format(integrator="direct", name="max_depth"))
+    assert main(["render", str(scene)]) == 1
+    said = capsys.readouterr().err
+    assert '"max_depth"' in said and "did you mean" not in said
 
 
 def test_property_given_as_a_parameter_of_the_scene(tmp_path, capsys):

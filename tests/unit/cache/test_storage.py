@@ -144,6 +144,48 @@ def test_caches_whose_samples_differ_in_kind_are_not_merged(other):
     assert first.streams == {0: 2 * BATCH, 1: 2 * BATCH}
 
 
+def moved() -> IrradianceCache:
+    """Return a cache whose grid is at another place than that of `cache`."""
+    other = cache(1)
+    other.grid = Grid(other.grid.shape, np.diag([1.0, 1.0, 1.01, 1.0]))
+    return other
+
+
+def shifted() -> IrradianceCache:
+    """Return a cache with values in as many, but other voxels than `cache`."""
+    other = cache(1)
+    other.grid, other.active = Grid((2, 2, 4), np.eye(4)), other.active + 8
+    return other
+
+
+def of_unknown_scene() -> IrradianceCache:
+    """Return a cache that was computed without a file, which has no digests of its scene."""
+    other = cache(1)
+    other.fingerprint = {}
+    return other
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (moved, "at different places"),
+        (shifted, "different voxels"),
+        (of_unknown_scene, "not recorded to which scene the.*cache_file"),
+    ],
+)
+def test_caches_that_may_be_of_different_scenes_are_not_merged(make, said):
+    first, other = cache(0), make()
+    if make is shifted:
+        first.grid = other.grid
+    for one, two in ((first, other), (other, first)):
+        with pytest.raises(IrrcacheError, match=said):
+            one.merge(two)
+    if make is of_unknown_scene:
+        with pytest.raises(IrrcacheError, match=said):
+            make().merge(make())
+    assert first.streams == {0: 2 * BATCH}
+
+
 @pytest.mark.parametrize("solver", ["sweep", "path"])
 @pytest.mark.parametrize("samples", [1, 8, 32, 64])
 def test_error_estimates_take_two_batches(scenes, solver, samples):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.compare.reference import CHUNK, Reference, reference, reference_path
-from mitsuba_irrcache.compare.scene_files import scene_files
+from mitsuba_irrcache.compare.scene_files import scene_inputs
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm import runs
 
@@ -78,7 +78,7 @@ def make(scene, spp=2, integrator="volpath", **parameters):
 
 def test_all_files_of_a_scene(scene):
     (scene.parent / "picture.exr").write_bytes(b"not named by the scene")
-    names = {file.name for file in scene_files(scene, {})}
+    names = {file.name for file in scene_inputs(scene, {})[0]}
     assert names == {"scene.xml", "camera.xml", "density.vol"}
 
 
@@ -106,6 +106,16 @@ def test_a_changed_file(scene, launches, file):
         path.write_text(path.read_text().replace("0.8", "0.7").replace('"2"', '"3"'))
     make(scene)
     assert len(launches) == 2 * count
+
+
+@pytest.mark.parametrize("size", [0, 100, 1000])
+def test_a_damaged_file_is_named(scene, size):
+    folder = scene.parent.parent / "kept"
+    make(scene)
+    (path,) = folder.iterdir()
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(IrrcacheError, match=rf'"{path}" is not a readable reference.*delete it'):
+        make(scene)
 
 
 def test_other_settings(scene, launches):

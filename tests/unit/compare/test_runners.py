@@ -263,6 +263,14 @@ def test_which_integrators_accept_an_effort(tmp_path):
         assert runners.effort_is_free(subject) is expected, integrator
 
 
+def test_relative_names_are_those_in_a_folder(tmp_path):
+    scene = tmp_path / "scene.xml"
+    scene.write_text('<scene version="3.0.0"><integrator type="volpath"/></scene>')
+    integrator = "irrcache{cache_file=light.cache}"
+    loaded = runners.Subject(scene, {}, integrator, folder=str(tmp_path / "own")).load()
+    assert f"cache_file = {tmp_path / 'own' / 'light.cache'}" in str(loaded.integrator())
+
+
 @pytest.mark.parametrize(("seconds", "budget"), [(0.5, 1.0), (2.0, 4.0), (9.0, 4.0)])
 def test_a_stated_error_has_one_image_with_its_estimate(seconds, budget):
     """It counts for the first budget that suffices, and its samples are those it has chosen."""

@@ -72,6 +72,17 @@ def test_a_scheduler_that_does_not_answer(monkeypatch):
         pytest.fail("it is connected to nothing")
 
 
+@pytest.mark.parametrize("content", ["", "[1]", "null", '{"a": 1}', '{"address": 5}', "\xff"])
+def test_a_file_that_names_no_scheduler(tmp_path, content):
+    file = tmp_path / "scheduler.json"
+    file.write_text(content, encoding="latin-1")
+    with (
+        pytest.raises(IrrcacheError, match=rf'^--scheduler: "{file}" names no address; name a'),
+        connected(options("--scheduler", file)),
+    ):
+        pytest.fail("it is connected to nothing")
+
+
 def test_a_worker_that_ends_while_it_is_asked_is_not_said_to_lack_anything():
     class Client:
         def run(self, function, name, on_error) -> dict:

@@ -11,7 +11,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm import dispatch
 from mitsuba_irrcache.farm.cluster import Connection
 from mitsuba_irrcache.farm.dispatch import Dispatch, SchedulerLostError
-from mitsuba_irrcache.farm.jobs import Environment, Job
+from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
 from mitsuba_irrcache.farm.results import Outcome
 
 ENVIRONMENT = Environment("llvm_ad_rgb")
@@ -126,6 +126,25 @@ def test_a_worker_of_another_kind_gets_no_more_jobs(capsys):
     assert cluster.submitted[-1] == ("sixth", ("b",))
     assert ("first", ("b",)) in cluster.submitted
     assert "worker a is not used: it has mitsuba 3.5" in capsys.readouterr().out
+
+
+def test_a_job_whose_files_have_changed_ends_alone(rgb, tmp_path):
+    """Workers find other files than those that the job was made for, through no fault of theirs."""
+    wanted = []
+    for name in ("first", "changed", "lost", "last"):
+        scene = tmp_path / f"{name}.xml"
+        scene.write_text('<scene version="3.0.0"/>')
+        arguments = {"name": name, "scene": scene_arguments(scene, {}, None)}
+        wanted.append(Job(name, "frame", arguments, ENVIRONMENT))
+    (tmp_path / "changed.xml").write_text('<scene version="3.0.0"> </scene>')
+    (tmp_path / "lost.xml").unlink()
+    unfit = Outcome("a", unfit="the files differ there from those here")
+    cluster, stored = Cluster({"changed": [unfit], "lost": [unfit], "last": [unfit]}), []
+    run = Dispatch(Connection(cluster), wanted, lambda job, _: stored.append(job.name))
+    failed = run.run()
+    assert sorted(stored) == ["first", "last"] and list(run.unfit) == ["a"]
+    assert sorted(failed) == ["changed", "lost"]
+    assert all("changed since the start" in reason for reason in failed.values())
 
 
 def test_workers_of_another_version_are_found_before_the_first_job(monkeypatch):

@@ -46,12 +46,29 @@ def test_values_that_cannot_be_meant(folder, vary, said):
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("", "a first row"), ("x\n", "no rows"), ("x,y\n1\n", "row 2 .* has 1 values"), (None, "No")],
+    [
+        ("", "a first row"),
+        ("x\n", "no rows"),
+        ("x,y\n1\n", "row 2 .* has 1 values"),
+        ("x,y, x\n1,2,3\n", '2 columns called "x"'),
+        ("x,y,\n1,2,\n", "a column without name"),
+        ("x,y\n1,2\n3, \n", 'row 3 .* has no value for "y"'),
+        (None, "No"),
+    ],
 )
 def test_tables_that_cannot_be_read(tmp_path, text, said):
     if text is not None:
         (tmp_path / "t.csv").write_text(text)
     with pytest.raises(IrrcacheError, match=said):
+        rows_of([], tmp_path / "t.csv", tmp_path)
+
+
+def test_a_table_of_a_spreadsheet(tmp_path):
+    """It begins with a mark of its encoding, or has another one."""
+    (tmp_path / "t.csv").write_bytes("\ufeffx,y\r\n1,2\r\n".encode())
+    assert rows_of([], tmp_path / "t.csv", tmp_path) == [{"x": "1", "y": "2"}]
+    (tmp_path / "t.csv").write_bytes("größe\r\n1\r\n".encode("latin-1"))
+    with pytest.raises(IrrcacheError, match="save it as UTF-8"):
         rows_of([], tmp_path / "t.csv", tmp_path)
 
 

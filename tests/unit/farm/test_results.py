@@ -43,6 +43,19 @@ def test_a_job_is_finished_while_its_inputs_and_files_are_the_same(results):
     assert not results.has(job(1))
 
 
+@pytest.mark.parametrize(
+    "content", ["", "[]", "null", "5", '"a"', "{}", '{"digest": 1, "files": []}', '{"files": 5}']
+)
+def test_a_job_with_a_damaged_record_is_not_finished(results, content):
+    results.store(job(1), outcome(1))
+    (record,) = (results.folder / ".farm").iterdir()
+    record.write_text(content)
+    assert not results.has(job(1))
+    results.remove(job(1))
+    results.store(job(1), outcome(1))
+    assert results.has(job(1))
+
+
 def test_results_are_continued_on_request_only(results):
     Results(results.folder).begin(resume=False)  # nothing is finished yet
     results.store(job(1), outcome(1))

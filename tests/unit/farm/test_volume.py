@@ -87,8 +87,8 @@ def both_sweeps(sweep: SlabSweep, pairs: int, channels: int) -> list[np.ndarray]
     return [file.read(*whole) for file in found]
 
 
-def farm_sweep(sigma_t, folder, inputs: str = "a") -> FarmSweep:
-    return FarmSweep(sigma_t, folder / "parts", MEMORY, Connection(None), ENVIRONMENT, inputs)
+def farm_sweep(sigma_t, folder, inputs: str = "a", memory: int = MEMORY) -> FarmSweep:
+    return FarmSweep(sigma_t, folder / "parts", memory, Connection(None), ENVIRONMENT, inputs)
 
 
 def by_one_machine(sigma_t, folder, pairs: int, channels: int) -> list[np.ndarray]:
@@ -191,6 +191,28 @@ def test_finished_jobs_of_other_inputs_are_not_used(sigma_t, tmp_path, monkeypat
     assert again.runs
 
 
+def test_a_run_with_other_memory_continues_with_the_same_slabs(sigma_t, tmp_path, monkeypatch):
+    """As with another number of workers, among which the memory of a machine is divided."""
+    little = 1 << 20
+    (tmp_path / "undisturbed").mkdir()
+    counts, found = [], []
+    for memory in (MEMORY, little):
+        workers = Workers(monkeypatch, 1)
+        folder = tmp_path / "undisturbed" / str(memory)
+        folder.mkdir()
+        found.append(both_sweeps(farm_sweep(sigma_t, folder, memory=memory), 4, 1))
+        counts.append(len(workers.runs))
+    assert counts[0] < counts[1]  # the slabs differ
+    first = Workers(monkeypatch, 1, limit=20)
+    with pytest.raises(KeyboardInterrupt):
+        both_sweeps(farm_sweep(sigma_t, tmp_path), 4, 1)
+    second = Workers(monkeypatch, 1)
+    resumed = both_sweeps(farm_sweep(sigma_t, tmp_path, memory=little), 4, 1)
+    assert len(first.runs | second.runs) == counts[0] and len(second.runs) < counts[0]
+    for mine, theirs in zip(resumed, found[0], strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
 def test_a_result_that_was_lost_is_not_taken_for_zeros(sigma_t, tmp_path, monkeypatch):
     Workers(monkeypatch, 1)
     sweep = farm_sweep(sigma_t, tmp_path)
@@ -258,6 +280,13 @@ def test_every_file_has_one_writer_that_its_only_reader_waits_for(slabs, batches
     }
     order = [step.name for step in by_length_of_way(steps)]
     assert all(order.index(n) < order.index(step.name) for step in steps for n in step.after)
+
+
+def test_a_damaged_plan_is_named(tmp_path):
+    for content in (b"", b"PK", b"x" * 100):
+        (tmp_path / f"a{volume_jobs.PLAN}").write_bytes(content)
+        with pytest.raises(IrrcacheError, match=r"a\.plan\.npz.*remove the folder"):
+            volume_jobs.SweepPlan.load(tmp_path, "a")
 
 
 def test_plans_hold_no_pickles(tmp_path):

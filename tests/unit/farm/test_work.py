@@ -22,11 +22,41 @@ from mitsuba_irrcache.farm.references import ReferenceRun
 from mitsuba_irrcache.farm.results import Outcome
 from mitsuba_irrcache.farm.studies import SceneStudy, arguments_by_scene
 from mitsuba_irrcache.farm.work import KINDS, UnfitWorkerError, set_up
-from mitsuba_irrcache.io.images import write_image
+from mitsuba_irrcache.io.images import read_image, write_image
+from mitsuba_irrcache.io.scene_files import load_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 SMALL = {"size": "8", "max_depth": "3"}
+#: A tumbler, of which Mitsuba's integrators render one image faster than with a cache.
+TUMBLER = """<scene version="3.0.0">
+    <integrator type="irrcache"/>
+    <sensor type="perspective">
+        <float name="fov" value="35"/>
+        <transform name="to_world">
+            <lookat origin="0, -5, 1.5" target="0, 0, 0.5" up="0, 0, 1"/>
+        </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="8"/> <integer name="height" value="8"/>
+        </film>
+    </sensor>
+    <emitter type="constant"/>
+    <medium type="homogeneous" id="milk"> <float name="albedo" value="0.9"/> </medium>
+    <shape type="cylinder">
+        <float name="radius" value="0.8"/>
+        <point name="p0" value="0, 0, 0"/> <point name="p1" value="0, 0, 1.2"/>
+        <bsdf type="dielectric"/> <ref id="milk" name="interior"/>
+    </shape>
+    <shape type="disk">
+        <transform name="to_world"> <scale value="0.8"/> <rotate x="1" angle="180"/> </transform>
+        <bsdf type="dielectric"/> <ref id="milk" name="interior"/>
+    </shape>
+    <shape type="disk">
+        <transform name="to_world"> <scale value="0.8"/> <translate z="1.2"/> </transform>
+        <bsdf type="dielectric"/> <ref id="milk" name="interior"/>
+    </shape>
+</scene>
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +116,46 @@ def test_a_worker_reads_exr_files_whatever_its_threads(environment, tmp_path):
         np.testing.assert_array_equal(np.array(mi.Bitmap(str(tmp_path / "image.exr"))), 1)
     finally:
         dr.set_thread_count(threads)
+
+
+def frame_job(
+    scene: Path, integrator: str | None, environment: Environment, parameters: dict
+) -> Job:
+    """Return a job of one frame."""
+    arguments = {"scene": scene_arguments(scene, parameters, integrator)}
+    arguments |= {"sensor": 0, "seed": 0, "spp": 1, "file": "frame.exr"}
+    return Job("frame", "frame", arguments, environment)
+
+
+def test_frames_share_a_cache_file_in_the_folder_of_the_command(
+    scene, environment, tmp_path, monkeypatch
+):
+    """Workers run in other folders, and the file is there from the second frame on."""
+    integrator = "irrcache{solver=path,resolution=4,cache_spp=16,cache_file=light.cache}"
+    monkeypatch.chdir(tmp_path)
+    job = frame_job(scene, integrator, environment, SMALL)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    first = outcome(job, tmp_path / "first")
+    assert (tmp_path / "light.cache").exists() and not any(Path.cwd().iterdir())
+    second = outcome(job, tmp_path / "second")
+    assert second.files["frame.png"] == first.files["frame.png"]
+    monkeypatch.chdir(tmp_path)
+    assert frame_job(scene, integrator, environment, SMALL).digest == job.digest
+
+
+def test_frames_that_need_no_cache_are_rendered_without_one(environment, tmp_path):
+    """As `irrcache render` does, and with the same image."""
+    path = tmp_path / "tumbler.xml"
+    path.write_text(TUMBLER)
+    scene = load_scene(path)
+    assert not scene.integrator().uses_cache(scene, spp=1)
+    found = outcome(frame_job(path, None, environment, {}), tmp_path / "found")
+    (tmp_path / "found.exr").write_bytes(found.files["frame.exr"])
+    expected = np.array(mi.render(scene, spp=1, seed=0))
+    assert scene.integrator().cache.samples == 0
+    # Mitsuba's film adds in no fixed order.
+    np.testing.assert_allclose(read_image(tmp_path / "found.exr"), expected, rtol=1e-5)
 
 
 def test_a_worker_that_sees_other_files_says_so(scene, tmp_path):

@@ -129,6 +129,31 @@ def test_search_path_is_restored(file):
     assert str(mi.file_resolver()) == before
 
 
+def test_spectra_beside_a_scene_are_found_and_its_folders_are_its_own(tmp_path, monkeypatch):
+    """Mitsuba's parser reads spectra, and adds a scene's <path> to its search path."""
+    before = str(mi.file_resolver())
+    (tmp_path / "data").mkdir()
+    paint = '<bsdf type="diffuse"><spectrum name="reflectance" filename="{}.spd"/></bsdf>'
+    for name, folder in (("here", tmp_path), ("there", tmp_path / "data")):
+        (folder / f"{name}.spd").write_text("400 0.5\n700 0.5\n")
+    bsdfs = "".join(paint.format(name) for name in ("here", "there"))
+    text = f'<scene version="3.0.0"><path value="data"/>{bsdfs}</scene>'
+    (tmp_path / "scene.xml").write_text(text)
+    load_scene(tmp_path / "scene.xml")
+    assert integrator_of(tmp_path / "scene.xml") == "path"
+    assert str(mi.file_resolver()) == before
+
+
+@pytest.mark.parametrize("given", [None, "irrcache{cache_file=light.cache}"])
+def test_what_an_integrator_writes_is_placed_in_a_folder(file, tmp_path, given):
+    integrator = '<integrator type="irrcache"><string name="cache_file" value="light.cache"/>'
+    text = file.read_text().replace('<integrator type="volpath">', integrator)
+    file.write_text(text.replace('<integer name="rr_depth" value="7"/>', ""))
+    scene = load_scene(file, integrator=given, folder=tmp_path / "elsewhere")
+    assert f"cache_file = {tmp_path / 'elsewhere' / 'light.cache'}" in str(scene.integrator())
+    assert "cache_file = light.cache" in str(load_scene(file, integrator=given).integrator())
+
+
 def test_integrator_of(file):
     assert integrator_of(file) == "volpath"
 

@@ -12,7 +12,13 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.out_of_core import irradiance_file, scattering, slab_march, slab_sweep
+from mitsuba_irrcache.out_of_core import (
+    irradiance_file,
+    rendering,
+    scattering,
+    slab_march,
+    slab_sweep,
+)
 from mitsuba_irrcache.out_of_core.brick_file import BrickFile
 from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
 from mitsuba_irrcache.out_of_core.volume_settings import parse_memory
@@ -120,6 +126,41 @@ def test_an_irradiance_file_of_the_same_inputs_is_read(density, tmp_path, monkey
     np.save(volume, density[::-1])
     os.utime(volume, ns=(past, past))
     np.testing.assert_array_equal(rendered(), later)
+
+
+def test_a_reader_shows_its_own_irradiance_after_the_file_was_replaced(density, tmp_path):
+    file = tmp_path / "irradiance.npy"
+
+    def scene(scale: float) -> mi.Scene:
+        files = {"irradiance_file": str(file)}
+        return scene_of(tmp_path, medium(scale, 0.9, PLACE), files=files)
+
+    expected, reader = image(scene(2.0), spp=1), scene(2.0)
+    np.testing.assert_array_equal(image(reader, spp=1), expected)
+    assert np.abs(image(scene(3.0), spp=1) - expected).max() > 0.01  # replaces the file
+    np.testing.assert_array_equal(image(reader, spp=1), expected)
+
+
+def test_a_file_that_is_overwritten_while_it_is_read_is_named(tmp_path):
+    path = tmp_path / "light.npy"
+    working = BrickFile.without_name(tmp_path / "working", (4, 3, 2), np.float32)
+    irradiance_file.write(path, working, np.ones(3), "mine")
+    found = irradiance_file.recorded(path, "mine")
+    assert (found.read((0, 0, 0), (4, 3, 2)) == 0).all()
+    with path.open("r+b") as file:
+        file.seek(-4, os.SEEK_END)
+        file.write(b"1234")
+    os.utime(path, ns=(0, 0))
+    with pytest.raises(IrrcacheError, match=rf'irradiance_file "{path}" was changed'):
+        found.read((0, 0, 0), (4, 3, 2))
+
+
+def test_a_missing_folder_is_named_before_anything_is_computed(density, tmp_path, monkeypatch):
+    monkeypatch.setattr(rendering, "MappedField", lambda *_: pytest.fail("the volume is read"))
+    file = tmp_path / "missing" / "light.npy"
+    scene = scene_of(tmp_path, medium(1.0, 0.9, PLACE), files={"irradiance_file": str(file)})
+    with pytest.raises(RuntimeError, match=rf'irradiance_file "{file}": the folder .* not exist'):
+        image(scene, spp=1)
 
 
 def test_a_record_is_that_of_the_file_that_was_written_with_it(tmp_path, monkeypatch):

@@ -66,6 +66,23 @@ def test_parts_give_the_bits_of_one_run(kind, build, tmp_path):
         np.testing.assert_array_equal(found, whole[name])
 
 
+def test_the_stream_of_another_seed_is_added_to_a_file(build, tmp_path):
+    """As one run does that continues the file with another ``cache_seed``."""
+    whole = {"solver": "path", "resolution": 8, "cache_file": str(tmp_path / "whole")}
+    for seed, samples in ((0, 64), (3, 160), (0, 192)):
+        scene = build(whole | {"cache_seed": seed, "cache_spp": samples})
+        scene.integrator().prepare(scene)
+        other = build({"solver": "path", "resolution": 8, "cache_seed": seed, "cache_spp": samples})
+        (medium,) = other.integrator().cached_media(other)
+        medium.use_file(other, tmp_path / "parts")
+        parts = StreamParts(other, medium)
+        for span in missing_parts(medium):
+            medium.cache.append(parts.compute(*span), span[0])
+        medium.cache.save(tmp_path / "parts")
+    assert medium.cache.streams == {0: 96, 3: 96}
+    assert (tmp_path / "parts").read_bytes() == (tmp_path / "whole").read_bytes()
+
+
 def test_a_part_is_never_counted_twice_or_too_early(build, tmp_path):
     scene = build(KINDS["path"][0])
     (medium,) = scene.integrator().cached_media(scene)

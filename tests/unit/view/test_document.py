@@ -59,15 +59,23 @@ def values(scene: mi.Scene) -> dict[str, np.ndarray]:
     }
 
 
-def test_document_equals_its_scene(path):
+@pytest.mark.parametrize("folder", ["", "data"])
+def test_document_equals_its_scene(path, folder):
     """A document equals its scene in every number, with transforms bit by bit and parameters
-    resolved.
+    resolved. Files may be in a folder that the scene names by <path>.
     """
+    if folder:
+        (path.parent / folder / "rgb").mkdir(parents=True)
+        (path.parent / "density.vol").rename(path.parent / folder / "density.vol")
+        head = '<scene version="3.0.0">'
+        path.write_text(SCENE.replace(head, f'{head} <path value="{folder}"/>'))
+    before = str(mi.file_resolver())
     expected = values(mi.load_file(str(path), strength=5))
     found = values(scene_of_text(scene_text(path, {"strength": "5"}), path.parent))
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         np.testing.assert_array_equal(found[key], value, err_msg=key)
+    assert str(mi.file_resolver()) == before
 
 
 def test_scene_edits(path):

@@ -1,0 +1,103 @@
+"""Runs of ``irrcache farm``, whose jobs are run here one by one."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mitsuba_irrcache.scenes import scene_path
+
+from mitsuba_irrcache.cli.main import main
+from mitsuba_irrcache.compare.results import Measurement, Snapshot
+from mitsuba_irrcache.farm import runs, studies, work
+from mitsuba_irrcache.farm.results import Outcome
+from mitsuba_irrcache.farm.work import KINDS
+from mitsuba_irrcache.io.images import write_image
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+#: Options by which nothing takes time.
+SMALL = ["-D", "size=8", "-D", "max_depth=3"]
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_kept(monkeypatch):
+    """Free what jobs leave for the next ones: kernels of later tests would differ with it."""
+    for name in ("_SCENES", "_CACHES"):
+        monkeypatch.setattr(work, name, work._Kept())
+
+
+class Here:
+    """Stand in for `Dispatch`: run jobs in this process."""
+
+    def __init__(self, folder: Path, jobs, store) -> None:
+        self.folder, self.jobs, self.store = folder, jobs, store
+
+    def run(self) -> dict[str, str]:
+        failed = {}
+        for number, job in enumerate(self.jobs):
+            scratch = self.folder / f"job-{number}"
+            scratch.mkdir()
+            try:
+                KINDS[job.kind](job.arguments, scratch)
+            except RuntimeError as error:
+                failed[job.name] = str(error)
+                continue
+            files = [path for path in scratch.rglob("*") if path.is_file()]
+            contents = {str(path.relative_to(scratch)): path.read_bytes() for path in files}
+            self.store(job, Outcome("here", files=contents))
+        return failed
+
+
+@pytest.fixture
+def here(tmp_path_factory, monkeypatch):
+    """Run jobs in this process, each in a new folder."""
+    monkeypatch.setattr(runs, "connected", lambda _: nullcontext(tmp_path_factory.mktemp("jobs")))
+    monkeypatch.setattr(runs, "Dispatch", Here)
+
+
+def copied(folder: Path) -> str:
+    """Return a copy of a scene in a new folder."""
+    folder.mkdir()
+    (folder / "scene.xml").write_text(Path(scene_path("cloud")).read_text())
+    return str(folder / "scene.xml")
+
+
+def measured(job, integrator, name, budgets, folder) -> None:
+    """Stand in for `measure_integrator`, which starts several processes."""
+    assert job["working_folder"] == str(Path.cwd())
+    write_image(folder / "images" / f"{name}.exr", np.full((8, 8, 3), 0.3, np.float32), {})
+    snapshot = Snapshot(budgets[0], {"image": 0.1}, 4, f"images/{name}.exr")
+    Measurement(integrator, name, [snapshot]).save(folder / "measurements" / f"{name}.json")
+
+
+def test_scenes_of_the_same_contents_have_a_report_each(here, tmp_path, monkeypatch, capsys):
+    reports: list[Path] = []
+    monkeypatch.setattr(work, "measure_integrator", measured)
+    monkeypatch.setattr(studies, "run_job", lambda *_: {})
+    monkeypatch.setattr(studies, "write_report", lambda args, folder, *_: reports.append(folder))
+    scenes = [copied(tmp_path / name) for name in ("a", "b")]
+    options = ["-i", "volpath", "-o", str(tmp_path / "out"), "--reference-spp", "4", *SMALL]
+    options += ["--references", str(tmp_path / "references")]
+    assert main(["farm", "study", *scenes, *options]) == 0
+    assert reports == [tmp_path / "out" / "a", tmp_path / "out" / "b"]
+    (only,) = (tmp_path / "references").iterdir()
+    # Nothing is left to be done, and a damaged file is made again.
+    (tmp_path / "out" / "b" / "measurements" / "1-volpath.json").write_text("[]")
+    assert main(["farm", "study", *scenes, *options, "--resume"]) == 0
+    assert reports[2:] == reports[:2] and only.exists()
+
+
+def test_a_reference_whose_jobs_all_fail(here, tmp_path, capsys, monkeypatch):
+    """The status and the message say so, and no traceback."""
+
+    def fails(*_):
+        raise RuntimeError("this integrator cannot render")
+
+    monkeypatch.setitem(KINDS, "reference_part", fails)
+    options = ["--references", str(tmp_path / "references"), "--reference-spp", "4", *SMALL]
+    assert main(["farm", "reference", copied(tmp_path / "a"), *options]) == 1
+    said = capsys.readouterr()
+    assert "this integrator cannot render" in said.err and "samples per pixel" not in said.out
