@@ -199,9 +199,8 @@ KINDS = {"check": check, "reference": make_reference, "measure": measure, "start
 def main() -> int:
     """Run the job; an exception is written to its ``error`` file."""
     job = json.loads(Path(sys.argv[1]).read_text())
-    if hasattr(
-        signal, "pthread_sigmask"
-    ):  # workers of irrcache farm, which may start this, block it
+    if hasattr(signal, "pthread_sigmask"):
+        # Workers of irrcache farm, which may start this process, block interrupts.
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         _set_up(job)
