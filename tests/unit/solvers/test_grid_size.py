@@ -55,6 +55,20 @@ def test_small_grids_get_more_voxels(shape):
     assert chosen(np.full(shape, 1.0), (1.0, 0.5, 0.25)) == (max(8, shape[0]), 16, 32)
 
 
+@pytest.mark.parametrize(("sigma_t", "expected"), [(3.0, 48), (0.8, 40), (0.01, 16)])
+def test_an_albedo_of_finer_data_is_resolved_where_it_matters(sigma_t, expected):
+    """Stripes of albedo in a homogeneous medium were lost between voxels chosen by its depth."""
+    frame = np.diag([1.0, 1.0, 1.0, 1.0])
+    turned = np.array([[0, 0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 1], [0, 0, 0, 1]])
+    for to_world, axis in ((frame, 0), (turned, 2)):
+        stripes = np.tile([0.0, 0.9], 24).reshape(48, 1, 1)  # along z of the grid
+        albedo = GridField(Grid(stripes.shape, to_world), mi.Float(np.float32(stripes.ravel())), 1)
+        extinction = ConstantField(np.array([sigma_t]))
+        found = MediumGrid(extinction, albedo, medium(np.ones((1, 1, 1))).boundary)
+        shape = choose_grid(found, 0, solver_named("path").size_rule)[0].shape
+        assert shape[axis] == expected
+
+
 def test_dense_grids_are_refined_by_optical_depth():
     """Dense grids are refined per axis by the optical depth, by a factor of eight at most, which
     is even from four on; opaque ones by ten.
