@@ -22,6 +22,7 @@ from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     Media,
     is_solid,
+    position_on,
     power_heuristic,
     visibility,
 )
@@ -259,8 +260,9 @@ class PathAdjoint:
         shadow.d = record.d
         shadow.maxt = dr.largest(mi.Float)
         none, rng = dr.zeros(mi.MediumPtr), mi.PCG32()
+        target = position_on(record, origin)
         passed, _ = visibility(
-            self._scene, Media([]), origin, record.p, none, rng, active, exact=True
+            self._scene, Media([]), origin, target, none, rng, active, exact=True
         )
         visible = active & (dr.max(passed) > 0)
         through = self._media.transmittance(shadow, record.dist, visible)

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.bounds import bounds_of_shapes
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.compile import media_of
@@ -39,7 +40,7 @@ def choose_stock(scene: mi.Scene) -> tuple[str, str]:
 def _chromaticity(scene: mi.Scene, medium: mi.Medium) -> float:
     """Return the ratio of the largest to the smallest channel of a medium's mean extinction."""
     rng = mi.PCG32(4096)
-    lower, upper = mi.Point3f(scene.bbox().min), mi.Point3f(scene.bbox().max)
+    lower, upper = (mi.Point3f(*map(float, end)) for end in bounds_of_shapes(scene))
     at = dr.zeros(mi.MediumInteraction3f, 4096)
     u = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
     at.p = lower + u * (upper - lower)

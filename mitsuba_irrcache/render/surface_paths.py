@@ -42,6 +42,7 @@ from mitsuba_irrcache.transport.path import (
     PartlyOriginalMedia,
     is_null,
     medium_after,
+    position_on,
     power_heuristic,
     sample_bsdf,
     visibility,
@@ -187,7 +188,8 @@ class SurfacePaths:
             behind = medium_after(si, record.d, pointer)
             far = are_distant(record.emitter)
             media = self._media_towards(vertex.p, record.d, far, ~far, is_original)
-            passed, rng = visibility(scene, media, vertex, record.p, behind, rng, reflects, exact)
+            target = position_on(record, vertex)
+            passed, rng = visibility(scene, media, vertex, target, behind, rng, reflects, exact)
             weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
             result += dr.select(reflects, value * passed * weight, 0)
             number += 1

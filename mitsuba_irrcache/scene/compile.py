@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.bounds import bounds_of_shapes, correct_mesh_bounds, lost_extent
 from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import UnsupportedSceneError
@@ -22,6 +23,7 @@ from mitsuba_irrcache.lights.emitters import (
     POINT_LIKE,
     EmitterKind,
     EmittersByKind,
+    are_distant,
     check_placement,
     illuminating,
     is_never_sampled,
@@ -78,6 +80,7 @@ def compile_scene(
     integrator. Raises UnsupportedSceneError, naming the object, for scenes that would be rendered
     incorrectly.
     """
+    correct_mesh_bounds(scene)
     emitters = EmittersByKind(illuminating(scene))
     media = media_of(scene)
     if not media:
@@ -93,6 +96,7 @@ def compile_scene(
         check_placement(emitter)
         _warn_of_weight(emitter)
         _warn_of_normals(emitter)
+    _warn_of_lost_bounds(scene)
     for sensor in scene.sensors():
         check_sensor(scene, sensor)
     has_surfaces = _has_surfaces(scene)
@@ -407,9 +411,21 @@ def _meets_media(scene: mi.Scene, instance: mi.ShapePtr, ray: mi.Ray3f):
     return inside
 
 
+def _warn_of_lost_bounds(scene: mi.Scene) -> None:
+    """Log a warning if volpath takes the scene to be smaller than it is."""
+    if lost_extent(scene) and any(are_distant(e) for e in scene.emitters()):
+        mi.Log(
+            mi.LogLevel.Warn,
+            "irrcache: Mitsuba has merged meshes of this scene and lost the bounding box of one of "
+            "them, so that its own integrators miss distant shapes that occlude a sun or an "
+            "environment: images by volpath may be too bright. Those by irrcache are not affected. "
+            "To compare them, load the scene with optimize=False.",
+        )
+
+
 def _warn_of_scale(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
     """Log a warning if Mitsuba's ray offset is large compared to a medium."""
-    corners = np.abs([np.array(scene.bbox().min), np.array(scene.bbox().max)])
+    corners = np.abs(bounds_of_shapes(scene))
     offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
     for grid in grids:
         size = np.linalg.norm(grid.frame[:3, :3], axis=0).min()
@@ -528,7 +544,7 @@ def _background_bound(scene: mi.Scene, brightest: float, has_surfaces: bool) -> 
     rng, count = mi.PCG32(BOUND_SAMPLES), BOUND_SAMPLES
     sample = mi.Point2f(rng.next_float32(), rng.next_float32())
     place = mi.Vector3f(*(rng.next_float32() for _ in range(3)))
-    ends = np.array([scene.bbox().min, scene.bbox().max], dtype=np.float64)
+    ends = bounds_of_shapes(scene)
     low, high = ends if np.isfinite(ends).all() else (np.zeros(3), np.ones(3))
     vertex = dr.zeros(mi.Interaction3f, count)
     vertex.p = mi.Point3f(*map(float, low)) + place * mi.Vector3f(*map(float, high - low))

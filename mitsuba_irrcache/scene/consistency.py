@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.bounds import bounds_of_shapes
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import orientation
@@ -155,7 +156,7 @@ def _starts(
     boxes = np.array([[s.bbox().min, s.bbox().max] for s in shapes], dtype=np.float64).reshape(
         -1, 6
     )
-    every = np.array([scene.bbox().min, scene.bbox().max], dtype=np.float64).reshape(6)
+    every = bounds_of_shapes(scene).reshape(6)
     boxes = np.where(np.isfinite(boxes), boxes, every)
     per_shape = max(WALKS_PER_SHAPE, WALKS // len(shapes))
     per_shape = max(1, min(per_shape, MOST_WALKS // len(shapes)))
@@ -436,7 +437,7 @@ def _refuse_infinite(names: _Names, medium: int) -> None:
 
 def _refuse_close(scene: mi.Scene, names: _Names, first: int, second: int) -> None:
     """Raise the error for shapes that are closer to each other than Mitsuba's ray offset."""
-    corners = np.abs([np.array(scene.bbox().min), np.array(scene.bbox().max)])
+    corners = np.abs(bounds_of_shapes(scene))
     offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
     raise UnsupportedSceneError(
         f"irrcache: {names.shape(first)} is closer to {names.shape(second)} than Mitsuba's rays "

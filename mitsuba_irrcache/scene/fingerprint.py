@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.bounds import bounds_of_shapes
 from mitsuba_irrcache.core.jit import graph_variables
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.lights.emitters import SPOT_LIKE, EmittersByKind
@@ -283,12 +284,12 @@ def beams(scene: mi.Scene) -> str:
     filter of their textures is neither a traversed parameter nor part of ``str(emitter)``.
     """
     found, emitters = [], EmittersByKind(scene.emitters()).of(*SPOT_LIKE)
-    box = scene.bbox()
+    lower, upper = (mi.Point3f(*map(float, end)) for end in bounds_of_shapes(scene))
     draws = [
         mi.sample_tea_float32(dr.arange(mi.UInt32, POSITIONS), mi.UInt32(k), 6) for k in range(4)
     ]
     at = dr.zeros(mi.Interaction3f, POSITIONS)
-    at.p = mi.Point3f(box.min) + mi.Point3f(draws[:3]) * mi.Vector3f(box.max - box.min)
+    at.p = lower + mi.Point3f(draws[:3]) * (upper - lower)
     for emitter in sorted(emitters, key=_object_digest):
         _, irradiance = emitter.sample_direction(at, mi.Point2f(0.5))
         found.append(float(dr.mean(_squashed(irradiance) * draws[3])[0]))

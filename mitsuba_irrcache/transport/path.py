@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.lights.emitters import are_distant
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.tracking import free_flight, medium_transmittance, transmittance
 
@@ -20,6 +21,9 @@ from mitsuba_irrcache.transport.tracking import free_flight, medium_transmittanc
 MOST_CROSSINGS = 1024
 #: Lobes of BSDFs that reflect, without diffuse ones.
 REFLECTION = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.GlossyReflection)
+#: Distance at which shadow rays to suns and environments end, over the diameter of the scene that
+#: Mitsuba has measured.
+FAR = 1e4
 #: Maximum survival probability of Russian roulette, as in ``volpath``.
 MAX_SURVIVAL = 0.95
 
@@ -282,6 +286,15 @@ def trace_to_infinity(
     return dr.select(escaped, attenuation, 0), radiance, rng
 
 
+def position_on(record: mi.DirectionSample3f, vertex: mi.Interaction3f) -> mi.Point3f:
+    """Return where a shadow ray from ``vertex`` to a sampled emitter ends: beyond all shapes for
+    suns and environments, whose distance follows from the bounding box of the scene, which is too
+    small where Mitsuba has merged meshes (`core/bounds`).
+    """
+    beyond = vertex.p + FAR * record.dist * record.d
+    return dr.select(are_distant(record.emitter), beyond, record.p)
+
+
 def with_valid_direction(record: mi.DirectionSample3f) -> mi.DirectionSample3f:
     """Return a sample of an emitter with any direction where there is none: in Mitsuba that from a
     black environment map is not a number, and remains so when it is multiplied by 0.
@@ -307,7 +320,8 @@ def sample_emitter(
     record, radiance = scene.sample_emitter_direction(vertex, sample, False, active)
     record = with_valid_direction(record)
     active_em = active & (record.pdf > 0) & (dr.max(radiance) > 0)
-    attenuation, rng = visibility(scene, media, vertex, record.p, pointer, rng, active_em)
+    target = position_on(record, vertex)
+    attenuation, rng = visibility(scene, media, vertex, target, pointer, rng, active_em)
     return record, dr.select(active_em, radiance * attenuation, 0), rng
 
 

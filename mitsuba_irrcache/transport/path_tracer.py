@@ -24,6 +24,7 @@ from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     Media,
     medium_after,
+    position_on,
     power_heuristic,
     sample_bsdf,
     visibility,
@@ -272,8 +273,9 @@ class PathTracer:
             )
         active &= dr.max(value) > 0
         medium = dr.select(segment.surface, medium_after(si, record.d, path.pointer), path.pointer)
+        target = position_on(record, vertex)
         attenuation, path.rng = visibility(
-            self.scene, self.media, vertex, record.p, medium, rng, active
+            self.scene, self.media, vertex, target, medium, rng, active
         )
         mis_weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
         sums.scattered += dr.select(

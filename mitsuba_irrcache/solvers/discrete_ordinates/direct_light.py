@@ -26,7 +26,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, varies_in_space
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.medium_probe import probe
-from mitsuba_irrcache.transport.path import Media, visibility
+from mitsuba_irrcache.transport.path import Media, position_on, visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 #: Mean solid angle [sr] of an emitter, seen from the voxels, above which tracks hit it.
@@ -173,16 +173,16 @@ class EmitterSampling:
             record, irradiance = _sample_textured(emitter, vertex, sample, by_shape)
         else:
             record, irradiance = emitter.sample_direction(vertex, sample)
-        visible = dr.max(irradiance) > 0
+        visible, target = dr.max(irradiance) > 0, position_on(record, vertex)
         if self._is_shared:
             pointer = probe(self.scene, p, record.d)
             passed, rng = visibility(
-                self.scene, self._media, vertex, record.p, pointer, rng, visible, exact=True
+                self.scene, self._media, vertex, target, pointer, rng, visible, exact=True
             )
             return dr.select(visible, irradiance * passed, 0), record.d, rng
         # The transmittance of this medium is integrated separately, without noise.
         passed, rng = visibility(
-            self.scene, self._other_media, vertex, record.p, medium.pointer, rng, visible
+            self.scene, self._other_media, vertex, target, medium.pointer, rng, visible
         )
         visible &= dr.max(passed) > 0
         passed *= medium_transmittance(medium, mi.Ray3f(p, record.d), record.dist, visible)
