@@ -42,6 +42,9 @@ TANGENT = 0.3
 #: Distance of another surface from a node, over the spacing, below which this surface may lie
 #: between nodes, as in corners and below objects.
 CLEARANCE = 1.5
+#: Distance, in units of the spacing at level 0, by multiples of which the origin moves with the
+#: camera.
+ORIGIN_STEP = 1024.0
 #: Largest level: finer lattices would be finer than the rounding of positions.
 FINEST_LEVEL = 24
 #: Offset of the lattices' origin, so that planes at round coordinates are not on the boundary of
@@ -79,6 +82,7 @@ class _SurfaceCorner(NamedTuple):
     Attributes:
         key, number: of the node.
         exists: whether the table has it.
+        can_exist: whether its key can express its place.
         weight: for the interpolation at the point, not normalised; 0 if the node does not apply.
         finer: whether interpolation needs a finer level.
         divided: whether another surface may lie between the node and the point.
@@ -87,6 +91,7 @@ class _SurfaceCorner(NamedTuple):
     key: mi.UInt64
     number: mi.UInt32
     exists: mi.Bool
+    can_exist: mi.Bool
     weight: mi.Float
     finer: mi.Bool
     divided: mi.Bool
@@ -101,10 +106,9 @@ class SurfaceNodes:
         spacing = COARSEST * float(np.linalg.norm(upper - lower))
         origin = 0.5 * (lower + upper) + SHIFT * spacing
         self.spacing = dr.opaque(mi.Float, spacing)
-        self._origin, self._lower, self._upper = (
-            mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in corner))
-            for corner in (origin, lower, upper)
-        )
+        self._step = ORIGIN_STEP * spacing
+        self._default_origin, self._origin = origin, _opaque(origin)
+        self._lower, self._upper = _opaque(lower), _opaque(upper)
         self.count = 0
         self.keys = mi.UInt64(0)
         #: per node: position and harmonic mean distance (0 where there is no surface); shading
@@ -112,6 +116,14 @@ class SurfaceNodes:
         self._places, self._normals = mi.Float([0.0] * 4), mi.Float([0.0] * 4)
         self._geometric = mi.Float([0.0] * 4)
         self._slots, self._mask = mi.UInt32([NONE, NONE]), dr.opaque(mi.UInt32, 1)
+
+    def set_origin_near(self, p: np.ndarray) -> None:
+        """Move the origin of the lattices towards a world position (3,), if there are no nodes yet:
+        keys can express places of fine lattices near the origin only.
+        """
+        if not self.count:
+            steps = np.round((np.asarray(p) - self._default_origin) / self._step)
+            self._origin = _opaque(self._default_origin + steps * self._step)
 
     # Lookup
 
@@ -139,7 +151,7 @@ class SurfaceNodes:
         keys = [mi.UInt64(0) for _ in range(4)]
         missing, uncertain, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
         while dr.hint(active, label="levels of surface nodes"):
-            total, incomplete = mi.Float(0), mi.Bool(False)
+            total, incomplete, impossible = mi.Float(0), mi.Bool(False), mi.Bool(False)
             finer, divided = mi.Bool(False), mi.Bool(False)
             corners = [self._corner(point, level, k, active) for k in range(4)]
             for k, corner in enumerate(corners):
@@ -148,6 +160,7 @@ class SurfaceNodes:
                 divided |= corner.divided
                 total += corner.weight
                 incomplete |= active & ~corner.exists
+                impossible |= ~corner.can_exist
             # Interpolation at a coarser level than the point requires would be biased.
             finer |= divided | (total == 0)
             ends = active & ~incomplete & (~finer | (level >= last)) & (total > 0)
@@ -157,7 +170,7 @@ class SurfaceNodes:
                 chosen = ends & (corner.weight > 0)
                 numbers[k] = dr.select(chosen, corner.number, numbers[k])
                 weights[k] = dr.select(ends, corner.weight * scale, weights[k])
-            missing |= incomplete
+            missing |= incomplete & ~impossible
             active &= ~incomplete & finer & (level < last)
             level = dr.select(active, level + 1, level)
         return numbers, weights, uncertain, keys, missing
@@ -171,7 +184,8 @@ class SurfaceNodes:
         at_u, at_v = dr.floor(u) + (k & 1), dr.floor(v) + (k >> 1)
         height = place.z / spacing + slope.x * (at_u - u) + slope.y * (at_v - v)
         key = _packed(point.axis * 2 + point.side, level, at_u, at_v, dr.floor(height))
-        number = self._number_of(key, active)
+        can_exist = dr.maximum(dr.maximum(dr.abs(at_u), dr.abs(at_v)), dr.abs(height)) < OFFSET - 1
+        number = self._number_of(key, active & can_exist)
         exists = active & (number != NONE)
         found = dr.gather(mi.Vector4f, self._places, number, exists)
         normal = dr.gather(mi.Vector4f, self._normals, number, exists)
@@ -184,6 +198,7 @@ class SurfaceNodes:
             key,
             number,
             exists,
+            can_exist,
             weight=dr.select(applies, dr.maximum(weight, 1e-6), 0),
             finer=applies & ((found.w * SPACING_PER_DISTANCE < spacing) | (cosine < FLAT)),
             divided=on_surface & (normal.w < CLEARANCE * spacing),
@@ -348,6 +363,10 @@ class SurfaceNodes:
         """Return two random words per node, which depend on its key only."""
         key = dr.gather(mi.UInt64, self.keys, numbers)
         return mi.sample_tea_32(mi.UInt32(key), mi.UInt32(key >> 32))
+
+
+def _opaque(p: np.ndarray) -> mi.Point3f:
+    return mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in p))
 
 
 def _across(

@@ -368,6 +368,7 @@ class ViewExtent(NamedTuple):
         per_distance: growth of the extent with distance.
         pixels: number of pixels along it.
         position, direction: means over the image of where rays start, and of their directions.
+        spread: largest distance of where rays start from ``position``.
     """
 
     at_sensor: float
@@ -375,6 +376,7 @@ class ViewExtent(NamedTuple):
     pixels: float
     position: tuple[float, float, float]
     direction: tuple[float, float, float]
+    spread: float
 
 
 def view_extent(sensor: mi.Sensor) -> ViewExtent:
@@ -393,8 +395,11 @@ def view_extent(sensor: mi.Sensor) -> ViewExtent:
     first, second = rays
     apart = dr.norm(second.o - first.o), dr.norm(second.d - first.d)
     extent = (float(np.median(np.array(each) * size[axis])) for each in apart)
-    means = (tuple(np.array(each).mean(axis=1).tolist()) for each in (first.o, first.d))
-    return ViewExtent(*extent, float(np.sqrt(size.prod())), *means)
+    starts, directions = np.array(first.o, float), np.array(first.d, float)
+    position = starts.mean(axis=1)
+    spread = np.linalg.norm(starts - position[:, None], axis=0).max()
+    means = (tuple(each.tolist()) for each in (position, directions.mean(axis=1)))
+    return ViewExtent(*extent, float(np.sqrt(size.prod())), *means, float(spread))
 
 
 def _sampled(

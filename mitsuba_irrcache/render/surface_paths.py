@@ -106,7 +106,7 @@ class SurfacePaths:
         self._original_media = media.original()
         self.peak_distance = dr.opaque(mi.Float, PEAK_DISTANCE)
         self._view_extent = mi.Float(0), mi.Float(0)
-        self._camera = mi.Point3f(0)
+        self._camera, self._camera_spread = mi.Point3f(0), mi.Float(0)
         self._finest_in_view = mi.Float(0)
         self._finest_from_nodes = mi.Float(0)
         #: irradiance of the nodes, one array for each channel
@@ -114,8 +114,11 @@ class SurfacePaths:
 
     def bound_spacing(self, view: ViewExtent) -> None:
         """Bound the spacing of nodes by what an image shows."""
+        self.nodes.set_origin_near(np.array(view.position))
         across = max(COARSEST_IN_VIEW, COARSEST_PIXELS / view.pixels)
         self._camera = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in view.position))
+        # Rays of several sensors start at different positions: this is the least distance.
+        self._camera_spread = dr.opaque(mi.Float, view.spread)
         self._view_extent = tuple(
             dr.opaque(mi.Float, across * x) for x in (view.at_sensor, view.per_distance)
         )
@@ -127,7 +130,10 @@ class SurfacePaths:
         ``travelled`` this distance from a node or from the camera.
         """
         at_sensor, per_distance = self._view_extent
-        distance = dr.norm(p - self._camera) if from_node else travelled
+        if from_node:
+            distance = dr.maximum(dr.norm(p - self._camera) - self._camera_spread, 0)
+        else:
+            distance = travelled
         coarsest = dr.fma(per_distance, distance, at_sensor)
         if from_node:
             finest = dr.maximum(coarsest * self._finest_from_nodes, FINEST_FROM_NODES * travelled)
