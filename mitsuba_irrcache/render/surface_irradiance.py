@@ -133,9 +133,9 @@ class SurfaceIrradiance:
         Returns the points that further rays from the nodes hit, and whether they hit any.
         """
         ray, length = self.nodes.rays(numbers)
-        p, normals, valid = _first_surface(scene, ray, length)
+        p, normals, valid, several = _first_surface(scene, ray, length)
         medium = self._medium_before(scene, p, normals[0], medium)
-        dr.eval(p, normals, valid, medium)
+        dr.eval(p, normals, valid, several, medium)
         count = dr.width(numbers)
         lane, k = Divisor(DISTANCE_RAYS).split(dr.arange(mi.UInt32, count * DISTANCE_RAYS))
         start, rng = self._ray_from(scene, p, normals, numbers, (lane, k), DISTANCE_RAYS)
@@ -147,6 +147,8 @@ class SurfaceIrradiance:
         mean = dr.block_sum(closeness, DISTANCE_RAYS) / DISTANCE_RAYS
         distance = dr.select(valid, dr.rcp(dr.maximum(mean, 1e-18)), 0)
         clearance = dr.block_reduce(dr.ReduceOp.Min, surface, DISTANCE_RAYS)
+        # The surface of a node that might be on either of two is known at finer levels only.
+        clearance = dr.select(several, 0, clearance)
         self.nodes.place(p, normals, distance, clearance, medium)
         return other, found
 
@@ -329,27 +331,33 @@ def _joined(parts: Sequence) -> object:
 
 @symbolic
 def _first_surface(scene: mi.Scene, ray: mi.Ray3f, length: mi.Float):
-    """Find the first surface along ``ray`` that is not null and reflects diffusely.
+    """Find the first surface along ``ray`` that is neither null nor black on the side of the ray.
 
-    Returns its position, its geometric and shading normal, and whether there is one.
+    Returns its position, its geometric and shading normal, and whether it is diffuse; and whether
+    there are further ones up to ``length``, to which a node with this ray might belong as well.
     """
     ray, remaining = mi.Ray3f(ray), mi.Float(length)
     position, geometric, shading = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
-    found, active, crossings = mi.Bool(False), mi.Bool(True), mi.UInt32(0)
+    found, met, several = mi.Bool(False), mi.Bool(False), mi.Bool(False)
+    active, crossings = mi.Bool(True), mi.UInt32(0)
     while dr.hint(active, label="place nodes"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid() & (si.t <= remaining)
         remaining -= si.t
         null = is_null(si.bsdf().flags())
-        diffuse, _ = lambertian(si, active & ~null)
+        diffuse, value = lambertian(si, active & ~null)
+        # Surfaces like the back of a one-sided one reflect nothing, so that they need no nodes.
+        black = diffuse & ~(dr.max(value) > 0)
+        several |= met & active & ~null & ~black
+        diffuse &= ~black & ~met
         normals = facing(si, ray.d)
         steep = dr.abs(dr.dot(normals[0], ray.d)) < MIN_SLOPE
         position = dr.select(diffuse, si.p, position)
         geometric = dr.select(diffuse, normals[0], geometric)
         shading = dr.select(diffuse, normals[1], shading)
         found |= diffuse & ~steep
-        active &= null
+        met |= active & ~null & ~black
         ray = si.spawn_ray(ray.d)
         crossings += 1
-        active &= crossings < MOST_CROSSINGS
-    return position, (geometric, shading), found
+        active &= ~several & (crossings < MOST_CROSSINGS)
+    return position, (geometric, shading), found, several

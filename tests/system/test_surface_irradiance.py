@@ -131,6 +131,21 @@ def filtered_lamps() -> dict:
     }  # fmt: skip
 
 
+def contact(one_sided: bool) -> dict:
+    """Return balls that stand on a floor above which the camera looks below them: their lower sides
+    and the back of the floor face the same way, close to each other.
+    """
+    bsdf = diffuse(0.7, 0.7, 0.7)
+    floor = ground(bsdf=bsdf if one_sided else {"type": "twosided", "bsdf": bsdf})
+    balls = {f"ball{n}": ball((x, -0.6, -3.4), 0.5) for n, x in enumerate((-0.4, 0.7))}
+    look = mi.ScalarTransform4f().look_at([0.1, -1.07, -4.6], [0.1, -1.0, -3.4], [0, 1, 0])
+    film_of = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "to_world": look, "fov": 50.0, "film": film_of}
+    emitter = {"type": "constant", "radiance": colour(0.6, 0.8, 1)}
+    smoke = bound(interior=fog())
+    return {"smoke": smoke, "floor": floor, "emitter": emitter, "sensor": sensor} | balls
+
+
 SCENES = {
     "filtered lamps": (filtered_lamps, {}),
     "many lights": (many_lights, {}),
@@ -138,6 +153,8 @@ SCENES = {
     "still life": (still_life, {}),
     "sun in a map": (sun_in_a_map, {}),
     "within the medium": (within, {}),
+    "contact": (partial(contact, one_sided=True), {}),
+    "contact, two-sided": (partial(contact, one_sided=False), {}),
 }
 
 
