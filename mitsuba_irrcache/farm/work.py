@@ -66,7 +66,7 @@ def run_job(kind: str, arguments: dict, environment: Environment) -> Outcome:
         folder = Path(scratch)
         try:
             set_up(environment)
-            KINDS[kind](arguments, folder)
+            digests = KINDS[kind](arguments, folder) or {}
         except UnfitWorkerError as error:
             return Outcome(worker, unfit=str(error))
         except Exception as error:
@@ -77,7 +77,7 @@ def run_job(kind: str, arguments: dict, environment: Environment) -> Outcome:
             for path in sorted(folder.rglob("*"))
             if path.is_file()
         }
-        return Outcome(worker, time.perf_counter() - started, files)
+        return Outcome(worker, time.perf_counter() - started, files, digests)
 
 
 def set_up(environment: Environment) -> None:
