@@ -12,7 +12,8 @@ import numpy as np
 
 from mitsuba_irrcache.cli.render import chosen_integrator
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
+from mitsuba_irrcache.farm.jobs import Environment, Job, caches_of, scene_arguments
+from mitsuba_irrcache.farm.results import Results
 from mitsuba_irrcache.io.scene_files import load_scene
 
 #: Largest number of frames of one run; more are most likely a mistake, such as 0:1:1e9.
@@ -146,3 +147,23 @@ def frame_jobs(
                 "file": f"{name}.exr",
             }
             yield Job(name, "frame", own, environment)
+
+
+def begin_frames(jobs: list[Job], results: Results) -> list[Job]:
+    """Return the jobs of the frames that have to be rendered, and remove what an earlier run has
+    left of these: where one fails, no image of other inputs stays beside the others.
+
+    A frame is finished if its inputs are the same, and each cache file that it names is missing, or
+    is as it was after the frame had been rendered.
+    """
+    missing = [job for job in jobs if not (results.has(job) and _has_same_caches(job, results))]
+    for job in missing:
+        results.remove(job)
+        for file in results.folder.glob(f"{job.name}.*"):  # the record may be damaged
+            file.unlink()
+    return missing
+
+
+def _has_same_caches(job: Job, results: Results) -> bool:
+    then, now = results.digests(job), caches_of(job.arguments["scene"])
+    return all(then.get(name) == digest for name, digest in now.items())

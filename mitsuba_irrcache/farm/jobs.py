@@ -11,7 +11,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from mitsuba_irrcache.compare.scene_files import scene_digest
+from mitsuba_irrcache.compare.scene_files import cache_digests, scene_digest
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.versions import DISTRIBUTION, installed_version
 
@@ -116,5 +116,15 @@ def scene_arguments(
 
 def contents_of(scene: dict) -> str:
     """Return the digest of the files that are named by arguments of a job, as they are now."""
-    names = "parameters", "integrator", "folder"
-    return scene_digest(Path(scene["scene"]), *(scene[name] for name in names))
+    return scene_digest(*_place(scene))
+
+
+def caches_of(scene: dict) -> dict[str, str]:
+    """Return the digests of the cache files that are named by arguments of a job, and that exist
+    now, by name.
+    """
+    return cache_digests(*_place(scene))
+
+
+def _place(scene: dict) -> tuple[Path, dict[str, str], str | None, str]:
+    return Path(scene["scene"]), scene["parameters"], scene["integrator"], scene["folder"]

@@ -22,7 +22,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.cache import CacheRun
 from mitsuba_irrcache.farm.cluster import MOST_WORKERS, ClusterOptions, connected
 from mitsuba_irrcache.farm.dispatch import Dispatch
-from mitsuba_irrcache.farm.frames import frame_jobs
+from mitsuba_irrcache.farm.frames import begin_frames, frame_jobs
 from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
 from mitsuba_irrcache.farm.references import ReferenceRun
 from mitsuba_irrcache.farm.results import Outcome, Results
@@ -96,9 +96,17 @@ def run_frames(args: argparse.Namespace) -> int:
     results = Results(args.output)
     results.begin(args.resume)
     jobs = list(frame_jobs(args, *_scene(args), environment))
-    status = _dispatch(options, [job for job in jobs if not results.has(job)], results.store)
+    status = _dispatch(options, begin_frames(jobs, results), results.store)
     there = sum(map(results.has, jobs))
     print(f"{there} of {len(jobs)} frames are in {args.output}")
+    if not status and there < len(jobs):
+        print(
+            f'irrcache: frames in "{args.output}" were changed meanwhile: another command may be '
+            "using the folder. When it has ended, start this one again with --resume, or name "
+            "another folder.",
+            file=sys.stderr,
+        )
+        return 1
     return status
 
 

@@ -24,6 +24,7 @@ from mitsuba_irrcache.farm import volume_jobs
 from mitsuba_irrcache.farm.jobs import (
     Environment,
     UnfitWorkerError,
+    caches_of,
     contents_of,
     difference,
     software,
@@ -116,8 +117,12 @@ def cache_part(arguments: dict, folder: Path) -> None:
     part.save(folder / arguments["file"])
 
 
-def frame(arguments: dict, folder: Path) -> None:
-    """Render an image; the caches of the last frame are used again where they fit."""
+def frame(arguments: dict, folder: Path) -> dict[str, str]:
+    """Render an image; the caches of the last frame are used again where they fit.
+
+    Returns the digests of the cache files of the scene: a frame does not depend on what it writes
+    to them, but it does on what others write later.
+    """
     scene = _loaded(arguments["scene"])
     integrator = scene.integrator()
     sensor, seed, spp = (arguments[name] for name in ("sensor", "seed", "spp"))
@@ -129,6 +134,7 @@ def frame(arguments: dict, folder: Path) -> None:
     about = described(scene, source, sensor, seed, spp) | {"parameters": json.dumps(parameters)}
     names = getattr(scene.integrator(), "aov_names", list)()
     write_image(folder / arguments["file"], image, about, names)
+    return caches_of(arguments["scene"])
 
 
 def _prepare(scene: mi.Scene) -> None:

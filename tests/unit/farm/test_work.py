@@ -83,11 +83,10 @@ def scene(tmp_path):
 def outcome(job: Job, folder: Path) -> Outcome:
     """Run a job as a worker does, in a new ``folder``."""
     folder.mkdir()
-    KINDS[job.kind](job.arguments, folder)
+    digests = KINDS[job.kind](job.arguments, folder) or {}
     files = [path for path in folder.rglob("*") if path.is_file()]
-    return Outcome(
-        "here", files={str(path.relative_to(folder)): path.read_bytes() for path in files}
-    )
+    contents = {str(path.relative_to(folder)): path.read_bytes() for path in files}
+    return Outcome("here", files=contents, digests=digests)
 
 
 @pytest.mark.parametrize(
