@@ -28,6 +28,7 @@ from mitsuba_irrcache.farm.jobs import (
     contents_of,
     difference,
     software,
+    source_digest,
 )
 from mitsuba_irrcache.farm.results import Outcome
 from mitsuba_irrcache.io.images import write_image
@@ -102,6 +103,12 @@ def set_up(environment: Environment) -> None:
     except Exception as error:
         message = original_message(error)
         raise UnfitWorkerError(f"{environment.variant} cannot be used: {message}") from error
+    for module, wanted in environment.sources:
+        if source_digest(module) != wanted:
+            raise UnfitWorkerError(
+                f'it has imported another version of the module "{module}" than the command; give '
+                "it the same files, and start it anew after they were edited"
+            )
 
 
 def cache_part(arguments: dict, folder: Path) -> None:

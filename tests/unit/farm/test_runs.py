@@ -183,3 +183,8 @@ def test_a_run_without_all_its_frames_has_a_status(frames, monkeypatch, capsys):
     assert frames("-i", "volpath")[0] == 1
     said = capsys.readouterr()
     assert "0 of 1 frames" in said.out and "another command may be using" in said.err
+
+
+def test_a_parameter_with_one_value_and_one_per_frame_is_refused(frames, capsys):
+    assert frames("-D", "sigma_t=3", "--vary", "sigma_t=1,2") == (1, [])
+    assert '"sigma_t" has the value "3" by -D' in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from mitsuba_irrcache.compare import reference as stored
 from mitsuba_irrcache.compare.command import common_job
 from mitsuba_irrcache.compare.results import Measurement, Snapshot
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.farm import references, studies, work
+from mitsuba_irrcache.farm import jobs, references, studies, work
 from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
 from mitsuba_irrcache.farm.references import ReferenceRun
 from mitsuba_irrcache.farm.results import Outcome
@@ -102,6 +103,37 @@ def test_a_worker_of_another_kind_says_why(environment, change, said):
     set_up(environment)
     with pytest.raises(UnfitWorkerError, match=said):
         set_up(replace(environment, **change))
+
+
+@pytest.mark.parametrize("is_package", [False, True])
+def test_edits_of_an_imported_module_are_seen(tmp_path, monkeypatch, is_package):
+    """Jobs have other digests, and a worker that has imported it before is of another kind."""
+    monkeypatch.syspath_prepend(tmp_path)
+    name = f"edited_plugin_{is_package}"
+    file = tmp_path / f"{name}.py"
+    if is_package:
+        file = tmp_path / name / "level.py"
+        file.parent.mkdir()
+        (file.parent / "__init__.py").write_text("from . import level\n")
+
+    def imported(content: str) -> Environment:
+        """As in a new process."""
+        file.write_text(content)
+        jobs.source_digest.cache_clear()
+        importlib.import_module(name)
+        return Environment.here("llvm_ad_rgb", [name], 0)
+
+    try:
+        first, again, second = map(imported, ("LEVEL = 1\n", "LEVEL = 1\n", "LEVEL = 2\n"))
+        digests = [Job("a", "frame", {}, each).digest for each in (first, again, second)]
+        assert digests[0] == digests[1] != digests[2]
+        imported("LEVEL = 1\n")
+        file.write_text("LEVEL = 2\n")
+        set_up(first)
+        with pytest.raises(UnfitWorkerError, match=f'another version of the module "{name}"'):
+            set_up(second)
+    finally:
+        jobs.source_digest.cache_clear()
 
 
 def test_a_worker_reads_exr_files_whatever_its_threads(environment, tmp_path):
