@@ -74,6 +74,11 @@ class Results:
         self._records.mkdir(parents=True, exist_ok=True)
 
     @property
+    def has_folder(self) -> bool:
+        """Whether the folder that `begin` has created is there."""
+        return self._records.is_dir()
+
+    @property
     def has_any(self) -> bool:
         """Whether there is any finished job."""
         return self._records.is_dir() and any(self._records.iterdir())

@@ -79,12 +79,24 @@ def _fill_volume(
     medium.use_file(file)
     sharing = 1 if options.scheduler else options.workers
     memory = memory_beside_python(medium.max_memory or total_memory() // (2 * sharing))
-    with terminated_like_interrupted(), connected(options) as connection:
+    sweep: FarmSweep | None = None
+    try:
+        with terminated_like_interrupted(), connected(options) as connection:
 
-        def begin(sigma_t: MappedField, inputs: str) -> FarmSweep:
-            return FarmSweep(sigma_t, parts, memory, connection, environment, inputs)
+            def begin(sigma_t: MappedField, inputs: str) -> FarmSweep:
+                nonlocal sweep
+                sweep = FarmSweep(sigma_t, parts, memory, connection, environment, inputs)
+                return sweep
 
-        medium.compute(scene, begin, None)
+            medium.compute(scene, begin, None)
+    except (IrrcacheError, OSError) as error:
+        if sweep is None or sweep.has_folder:
+            raise
+        raise IrrcacheError(
+            f'the folder "{parts}" was removed during the run, as by another command for the same '
+            f'-o "{file}" that has finished; see whether that file is there, otherwise start this '
+            "command again."
+        ) from error
     shutil.rmtree(parts, ignore_errors=True)
     print(f"wrote {file}")
     return 0

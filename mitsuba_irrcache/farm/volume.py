@@ -59,6 +59,11 @@ class FarmSweep(SlabSweep):
         self._results.begin(resume=True)
         super().__init__(sigma_t, own, _memory_of_first_run(own, memory))
 
+    @property
+    def has_folder(self) -> bool:
+        """Whether the folder of the working files is there: a command that finishes removes it."""
+        return self._results.has_folder
+
     def file(self, name: str, dtype: np.dtype = np.float32, channels: int = 1) -> BrickFile:
         """Create or open a working file for values of all voxels."""
         return BrickFile(self._folder / name, self.grid.shape, dtype, channels)
@@ -102,8 +107,8 @@ class FarmSweep(SlabSweep):
         if failed:
             first, reason = next(iter(failed.items()))
             raise IrrcacheError(
-                f"{first}: {reason}; {len(jobs) - len(failed)} of {len(jobs)} jobs are finished "
-                "and kept. Remove the cause and start the command again with --resume."
+                f"{first}: {reason.rstrip('.')}; {len(jobs) - len(failed)} of {len(jobs)} jobs are "
+                "finished and kept. Remove the cause and start the command again with --resume."
             )
         for path in self._folder.glob(f"{name}-*.npy"):
             path.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +13,14 @@ from mitsuba_irrcache.scenes import scene_path
 
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.compare.results import Measurement, Snapshot
-from mitsuba_irrcache.farm import runs, studies, work
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.farm import runs, studies, volume, work
+from mitsuba_irrcache.farm.cluster import Connection
 from mitsuba_irrcache.farm.results import Outcome, Results
 from mitsuba_irrcache.farm.work import KINDS
 from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
+from tests.support.scenes import VOLUME_IN_FILE
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -188,3 +192,24 @@ def test_a_run_without_all_its_frames_has_a_status(frames, monkeypatch, capsys):
 def test_a_parameter_with_one_value_and_one_per_frame_is_refused(frames, capsys):
     assert frames("-D", "sigma_t=3", "--vary", "sigma_t=1,2") == (1, [])
     assert '"sigma_t" has the value "3" by -D' in capsys.readouterr().err
+
+
+def test_the_second_of_two_commands_for_one_volume_says_so(tmp_path, monkeypatch, capsys):
+    """The first one has removed the working files when it was finished."""
+    folder = tmp_path / "light.npy.parts"
+
+    class Overtaken:
+        def __init__(self, *_) -> None:
+            shutil.rmtree(next(folder.iterdir()))  # as halfway through the removal
+
+        def run(self) -> None:
+            raise IrrcacheError("some file does not exist")
+
+    monkeypatch.setattr(runs, "connected", lambda _: nullcontext(Connection(None)))
+    monkeypatch.setattr(volume, "Dispatch", Overtaken)
+    np.save(tmp_path / "density.npy", np.ones((8, 8, 8), np.float32))
+    (tmp_path / "scene.xml").write_text(VOLUME_IN_FILE)
+    command = ["farm", "cache", str(tmp_path / "scene.xml"), "-o", str(tmp_path / "light.npy")]
+    assert main(command) == 1
+    said = capsys.readouterr().err
+    assert "light.npy.parts" in said and "by another command" in said
