@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import importlib
 from dataclasses import replace
 from pathlib import Path
@@ -173,6 +174,25 @@ def test_frames_share_a_cache_file_in_the_folder_of_the_command(
     assert second.files["frame.png"] == first.files["frame.png"]
     monkeypatch.chdir(tmp_path)
     assert frame_job(scene, integrator, environment, SMALL).digest == job.digest
+
+
+def test_cache_files_of_all_media_and_of_nested_integrators_are_found(scene, tmp_path):
+    """Each by the name that the scene gives, wherever the folder of the command is."""
+    own = '<integrator type="$integrator">\n        <integer name="max_depth" value="$max_depth"/>'
+    assert own in scene.read_text()
+    named = f'<integrator type="aov">{own} <string name="cache_file" value="a/light.cache"/>'
+    text = scene.read_text().replace(own, named).replace("</integrator>", "</integrator>" * 2, 1)
+    scene.write_text(text)
+    arguments = scene_arguments(scene, SMALL, None) | {"folder": str(tmp_path / "command")}
+    assert jobs.caches_of(arguments) == {}
+    (tmp_path / "command" / "a").mkdir(parents=True)
+    for name in ("light.cache", "light.fog.cache", "light2.cache", "light.png"):
+        (tmp_path / "command" / "a" / name).write_text(name)
+    expected = {
+        f"a/{name}": hashlib.sha256(name.encode()).hexdigest()
+        for name in ("light.cache", "light.fog.cache")
+    }
+    assert jobs.caches_of(arguments) == expected
 
 
 def test_frames_that_need_no_cache_are_rendered_without_one(environment, tmp_path):
