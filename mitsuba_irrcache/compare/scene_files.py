@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 from functools import lru_cache
 from pathlib import Path
@@ -50,6 +51,26 @@ def scene_digest(
         sha.update(hashlib.sha256(file.name.encode()).digest() + _digest(file))
     sha.update("".join(spectra).encode())
     return sha.hexdigest()
+
+
+def cache_digests(
+    path: Path, parameters: dict[str, str], integrator: str | None = None, folder: str | Path = ""
+) -> dict[str, str]:
+    """Return the SHA-256 of those files that a scene's integrators name as ``cache_file``, and that
+    exist, by name. With several media these are the files of all of them.
+    """
+    with parsed(path, parameters, folder) as (_, state):
+        if integrator is not None:
+            replace_integrator(state, integrator)
+        integrators = [node for node in state.nodes if node.type == mi.ObjectType.Integrator]
+        names = {str(node.props.get("cache_file", "")) for node in integrators} - {""}
+    found = {}
+    for name in map(Path, names):
+        of_media = f"{glob.escape(name.stem)}.*{glob.escape(name.suffix)}"
+        for file in {Path(folder) / name, *(Path(folder) / name).parent.glob(of_media)}:
+            if file.is_file():
+                found[str(name.parent / file.name)] = _digest(file).hex()
+    return found
 
 
 def _digest(file: Path) -> bytes:

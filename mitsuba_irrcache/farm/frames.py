@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import glob
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import numpy as np
 
 from mitsuba_irrcache.cli.render import chosen_integrator
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
+from mitsuba_irrcache.farm.jobs import Environment, Job, caches_of, scene_arguments
+from mitsuba_irrcache.farm.results import Results
 from mitsuba_irrcache.io.scene_files import load_scene
 
 #: Largest number of frames of one run; more are most likely a mistake, such as 0:1:1e9.
@@ -50,10 +52,10 @@ def _values(text: str, values: str, folder: Path) -> list[str]:
             first, last, count = float(parts[0]), float(parts[1]), int(parts[2])
         except ValueError:
             count = 0
-        if not 1 <= count <= MOST_FRAMES:
+        if not 1 <= count <= MOST_FRAMES or not (math.isfinite(first) and math.isfinite(last)):
             raise IrrcacheError(
-                f'cannot read --vary "{text}"; first:last:count are two numbers and a whole one '
-                f"from 1 to {MOST_FRAMES}."
+                f'cannot read --vary "{text}"; first:last:count are two finite numbers and a whole '
+                f"one from 1 to {MOST_FRAMES}."
             )
         return [f"{value:.9g}" for value in np.linspace(first, last, count)]
     if any(character in values for character in "*?["):
@@ -61,7 +63,27 @@ def _values(text: str, values: str, folder: Path) -> list[str]:
         if not found:
             raise IrrcacheError(f'--vary "{text}": no file in "{folder}" has such a name.')
         return found
-    return values.split(",")
+    found = [value.strip() for value in values.split(",")]
+    if "" in found:
+        raise IrrcacheError(
+            f'--vary "{text}" has no value for frame {found.index("")}, counted from 0; write one '
+            "between each two commas."
+        )
+    _check_finite(found, f'--vary "{text}"')
+    return found
+
+
+def _check_finite(values: list[str], place: str) -> None:
+    """Raise IrrcacheError if one of the values is an infinity or not a number, as programs write
+    them where a computation has failed.
+    """
+    for value in values:
+        try:
+            is_finite = math.isfinite(float(value))
+        except ValueError:  # a name
+            continue
+        if not is_finite:
+            raise IrrcacheError(f'{place} has the value "{value}"; numbers have to be finite.')
 
 
 def _columns(table: Path) -> dict[str, list[str]]:
@@ -75,6 +97,12 @@ def _columns(table: Path) -> dict[str, list[str]]:
     except (OSError, ValueError, csv.Error) as error:
         why = getattr(error, "strerror", None) or "a first row with names is needed"
         raise IrrcacheError(f'cannot read the table "{table}": {why}.') from error
+    for separator, called in ((";", "semicolons"), ("\t", "tabs")):
+        if len(head) == 1 and separator in head[0]:
+            raise IrrcacheError(
+                f'"{table}" has one column "{head[0]}"; its values seem to be separated by '
+                f"{called}: save it with commas between them."
+            )
     for name in head:
         if not name or head.count(name) > 1:
             found = (
@@ -94,6 +122,7 @@ def _columns(table: Path) -> dict[str, list[str]]:
                 f'row {number} of "{table}" has no value for "{head[row.index("")]}"; each row '
                 "needs a value in every column."
             )
+        _check_finite(row, f'row {number} of "{table}"')
     if not rows:
         raise IrrcacheError(f'"{table}" has no rows of values below the names.')
     return {name: [row[i] for row in rows] for i, name in enumerate(head)}
@@ -128,6 +157,11 @@ def frame_jobs(
     The scene of the first frame is loaded here, so that errors in it are found at once.
     """
     rows = rows_of(args.vary, args.table, scene.parent)
+    for name in sorted(parameters.keys() & rows[0].keys()):
+        raise IrrcacheError(
+            f'the parameter "{name}" has the value "{parameters[name]}" by -D, but also one for '
+            "each frame (--vary or the table); remove one of them."
+        )
     chosen = chosen_integrator(scene, parameters | rows[0], integrator)
     loaded = load_scene(scene, parameters | rows[0], chosen)
     sensors = sensors_of(args.sensors, len(loaded.sensors()))
@@ -146,3 +180,23 @@ def frame_jobs(
                 "file": f"{name}.exr",
             }
             yield Job(name, "frame", own, environment)
+
+
+def begin_frames(jobs: list[Job], results: Results) -> list[Job]:
+    """Return the jobs of the frames that have to be rendered, and remove what an earlier run has
+    left of these: where one fails, no image of other inputs stays beside the others.
+
+    A frame is finished if its inputs are the same, and each cache file that it names is missing, or
+    is as it was after the frame had been rendered.
+    """
+    missing = [job for job in jobs if not (results.has(job) and _has_same_caches(job, results))]
+    for job in missing:
+        results.remove(job)
+        for file in results.folder.glob(f"{job.name}.*"):  # the record may be damaged
+            file.unlink()
+    return missing
+
+
+def _has_same_caches(job: Job, results: Results) -> bool:
+    then, now = results.digests(job), caches_of(job.arguments["scene"])
+    return all(then.get(name) == digest for name, digest in now.items())

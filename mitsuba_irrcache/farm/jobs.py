@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import sys
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import mitsuba as mi
 
-from mitsuba_irrcache.compare.scene_files import scene_digest
+from mitsuba_irrcache.compare.scene_files import cache_digests, scene_digest
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.versions import DISTRIBUTION, installed_version
 
@@ -33,17 +34,22 @@ class Environment:
         software: versions by package, which have to be those of the workers.
         threads: of Dr.Jit in each worker; 0: all that the worker may use. Results do not depend on
             it.
+        sources: digests by name of those modules, which have to be those of the workers.
     """
 
     variant: str
     modules: tuple[str, ...] = ()
     software: tuple[tuple[str, str | None], ...] = ()
     threads: int = 0
+    sources: tuple[tuple[str, str], ...] = ()
 
     @classmethod
     def here(cls, variant: str, modules: list[str], threads: int) -> Environment:
-        """Return the environment of jobs that this process submits."""
-        return cls(variant, tuple(modules), software(), threads)
+        """Return the environment of jobs that this process, which has imported the modules,
+        submits.
+        """
+        sources = tuple((module, source_digest(module)) for module in modules)
+        return cls(variant, tuple(modules), software(), threads, sources)
 
 
 @dataclass(frozen=True)
@@ -74,7 +80,7 @@ class Job:
         contents = {key: scene[key] for key in scene if key not in ("scene", "folder")}
         arguments = self.arguments | {"scene": contents}
         parts = [self.kind, arguments, environment.variant, environment.modules]
-        text = json.dumps([*parts, environment.software], sort_keys=True)
+        text = json.dumps([*parts, environment.software, environment.sources], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
     @property
@@ -90,6 +96,24 @@ class Job:
 def software() -> tuple[tuple[str, str | None], ...]:
     """Return the versions of `SOFTWARE` in this process."""
     return tuple((name, installed_version(name)) for name in SOFTWARE)
+
+
+@cache
+def source_digest(module: str) -> str:
+    """Return the SHA-256 of the file of an imported module, or of all Python files of a package;
+    "" if it has none.
+
+    It is kept: a process goes on with what it has imported, whatever becomes of the file.
+    """
+    file = getattr(sys.modules[module], "__file__", None)
+    if not file or not Path(file).is_file():
+        return ""
+    path, sha = Path(file), hashlib.sha256()
+    files = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
+    for each in files:
+        sha.update(hashlib.sha256(str(each.relative_to(path.parent)).encode()).digest())
+        sha.update(hashlib.sha256(each.read_bytes()).digest())
+    return sha.hexdigest()
 
 
 def difference(name: str, found: str | None, wanted: str | None) -> str:
@@ -116,5 +140,15 @@ def scene_arguments(
 
 def contents_of(scene: dict) -> str:
     """Return the digest of the files that are named by arguments of a job, as they are now."""
-    names = "parameters", "integrator", "folder"
-    return scene_digest(Path(scene["scene"]), *(scene[name] for name in names))
+    return scene_digest(*_place(scene))
+
+
+def caches_of(scene: dict) -> dict[str, str]:
+    """Return the digests of the cache files that are named by arguments of a job, and that exist
+    now, by name.
+    """
+    return cache_digests(*_place(scene))
+
+
+def _place(scene: dict) -> tuple[Path, dict[str, str], str | None, str]:
+    return Path(scene["scene"]), scene["parameters"], scene["integrator"], scene["folder"]

@@ -26,6 +26,8 @@ class Outcome:
         worker: its address.
         seconds: duration of the job.
         files: contents by name.
+        digests: SHA-256 of what the job has written to, or read from, files that stay where they
+            are, by name.
         unfit: why this worker cannot run the jobs of this run, while others may.
         error: why the job failed.
     """
@@ -33,6 +35,7 @@ class Outcome:
     worker: str
     seconds: float = 0.0
     files: dict[str, bytes] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)
     unfit: str = ""
     error: str = ""
 
@@ -41,7 +44,7 @@ class Results:
     """Finished jobs of a folder.
 
     The record of a job is written after its files: a job with a record is finished. It holds the
-    digest of the job's inputs, and those of its files.
+    digest of the job's inputs, those of its files, and the `Outcome.digests`.
     """
 
     def __init__(self, folder: Path, records: str = ".farm") -> None:
@@ -71,19 +74,28 @@ class Results:
         self._records.mkdir(parents=True, exist_ok=True)
 
     @property
+    def has_folder(self) -> bool:
+        """Whether the folder that `begin` has created is there."""
+        return self._records.is_dir()
+
+    @property
     def has_any(self) -> bool:
         """Whether there is any finished job."""
         return self._records.is_dir() and any(self._records.iterdir())
 
     def has(self, job: Job) -> bool:
         """Return whether the job has finished with the same inputs, and its files are unchanged."""
-        digest, files = self._known(job)
+        digest, files, _ = self._known(job)
         try:
             return digest == job.digest and all(
                 _digest((self.folder / name).read_bytes()) == known for name, known in files.items()
             )
         except OSError:
             return False
+
+    def digests(self, job: Job) -> dict[str, str]:
+        """Return the `Outcome.digests` of a finished job."""
+        return self._known(job)[2]
 
     def store(self, job: Job, outcome: Outcome) -> None:
         """Write the files of a job, then its record."""
@@ -95,6 +107,7 @@ class Results:
         record = {
             "digest": job.digest,
             "files": {name: _digest(content) for name, content in outcome.files.items()},
+            "digests": outcome.digests,
             "seconds": outcome.seconds,
             "worker": outcome.worker,
         }
@@ -102,20 +115,20 @@ class Results:
 
     def remove(self, job: Job) -> None:
         """Remove the files of a job and its record."""
-        _, files = self._known(job)
+        _, files, _ = self._known(job)
         self._record(job).unlink(missing_ok=True)
         for name in files:
             (self.folder / name).unlink(missing_ok=True)
 
-    def _known(self, job: Job) -> tuple[str, dict[str, str]]:
+    def _known(self, job: Job) -> tuple[str, dict[str, str], dict[str, str]]:
         """Return the digests in the record of a job: of its inputs, "" without a readable record,
-        and of its files by name.
+        of its files by name, and the `Outcome.digests`.
         """
         try:
             record = json.loads(self._record(job).read_text())
-            return str(record["digest"]), dict(record["files"])
+            return str(record["digest"]), dict(record["files"]), dict(record["digests"])
         except (OSError, ValueError, KeyError, TypeError):  # no record, or a damaged one
-            return "", {}
+            return "", {}, {}
 
     def _record(self, job: Job) -> Path:
         return self._records / f"{job.name}.json"

@@ -22,7 +22,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.cache import CacheRun
 from mitsuba_irrcache.farm.cluster import MOST_WORKERS, ClusterOptions, connected
 from mitsuba_irrcache.farm.dispatch import Dispatch
-from mitsuba_irrcache.farm.frames import frame_jobs
+from mitsuba_irrcache.farm.frames import begin_frames, frame_jobs
 from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
 from mitsuba_irrcache.farm.references import ReferenceRun
 from mitsuba_irrcache.farm.results import Outcome, Results
@@ -79,12 +79,24 @@ def _fill_volume(
     medium.use_file(file)
     sharing = 1 if options.scheduler else options.workers
     memory = memory_beside_python(medium.max_memory or total_memory() // (2 * sharing))
-    with terminated_like_interrupted(), connected(options) as connection:
+    sweep: FarmSweep | None = None
+    try:
+        with terminated_like_interrupted(), connected(options) as connection:
 
-        def begin(sigma_t: MappedField, inputs: str) -> FarmSweep:
-            return FarmSweep(sigma_t, parts, memory, connection, environment, inputs)
+            def begin(sigma_t: MappedField, inputs: str) -> FarmSweep:
+                nonlocal sweep
+                sweep = FarmSweep(sigma_t, parts, memory, connection, environment, inputs)
+                return sweep
 
-        medium.compute(scene, begin, None)
+            medium.compute(scene, begin, None)
+    except (IrrcacheError, OSError) as error:
+        if sweep is None or sweep.has_folder:
+            raise
+        raise IrrcacheError(
+            f'the folder "{parts}" was removed during the run, as by another command for the same '
+            f'-o "{file}" that has finished; see whether that file is there, otherwise start this '
+            "command again."
+        ) from error
     shutil.rmtree(parts, ignore_errors=True)
     print(f"wrote {file}")
     return 0
@@ -96,9 +108,17 @@ def run_frames(args: argparse.Namespace) -> int:
     results = Results(args.output)
     results.begin(args.resume)
     jobs = list(frame_jobs(args, *_scene(args), environment))
-    status = _dispatch(options, [job for job in jobs if not results.has(job)], results.store)
+    status = _dispatch(options, begin_frames(jobs, results), results.store)
     there = sum(map(results.has, jobs))
     print(f"{there} of {len(jobs)} frames are in {args.output}")
+    if not status and there < len(jobs):
+        print(
+            f'irrcache: frames in "{args.output}" were changed meanwhile: another command may be '
+            "using the folder. When it has ended, start this one again with --resume, or name "
+            "another folder.",
+            file=sys.stderr,
+        )
+        return 1
     return status
 
 

@@ -18,10 +18,12 @@ from mitsuba_irrcache.farm.jobs import Environment, Job
 from mitsuba_irrcache.farm.results import Outcome, Results
 from mitsuba_irrcache.farm.volume_jobs import (
     FEWEST_SLABS,
+    FOUND,
     PAIRS,
     PLAN,
     SweepPlan,
     by_length_of_way,
+    require_unchanged,
     slices_of,
     steps_of,
 )
@@ -57,6 +59,11 @@ class FarmSweep(SlabSweep):
         self._results.begin(resume=True)
         super().__init__(sigma_t, own, _memory_of_first_run(own, memory))
 
+    @property
+    def has_folder(self) -> bool:
+        """Whether the folder of the working files is there: a command that finishes removes it."""
+        return self._results.has_folder
+
     def file(self, name: str, dtype: np.dtype = np.float32, channels: int = 1) -> BrickFile:
         """Create or open a working file for values of all voxels."""
         return BrickFile(self._folder / name, self.grid.shape, dtype, channels)
@@ -71,7 +78,7 @@ class FarmSweep(SlabSweep):
     ) -> BrickFile:
         channels = incoming.shape[2]
         is_new = not (self._folder / name).exists()
-        self.file(name, channels=channels).close()
+        file = self.file(name, channels=channels)
         plan = SweepPlan(
             name,
             self.grid.shape,
@@ -88,25 +95,53 @@ class FarmSweep(SlabSweep):
         missing = [
             job for job in jobs if not self._results.has(job) or (is_new and job.kind == "add_axes")
         ]
+        self._check(file, jobs, missing, used)
+        file.close()
 
         def store(job: Job, outcome: Outcome) -> None:
             self._results.store(job, outcome)
-            for file in used.get(job.name, ()):
-                (self._folder / file).unlink(missing_ok=True)
+            for read in used.get(job.name, ()):
+                (self._folder / read).unlink(missing_ok=True)
 
         failed = Dispatch(self._connection, missing, store).run()
         if failed:
             first, reason = next(iter(failed.items()))
             raise IrrcacheError(
-                f"{first}: {reason}; {len(jobs) - len(failed)} of {len(jobs)} jobs are finished "
-                "and kept. Remove the cause and start the command again with --resume."
+                f"{first}: {reason.rstrip('.')}; {len(jobs) - len(failed)} of {len(jobs)} jobs are "
+                "finished and kept. Remove the cause and start the command again with --resume."
             )
-        for file in self._folder.glob(f"{name}-*.npy"):
-            file.unlink()
+        for path in self._folder.glob(f"{name}-*.npy"):
+            path.unlink(missing_ok=True)
         if source is not None:
-            source.path.unlink()
+            source.path.unlink(missing_ok=True)
         # Opened now, since network file systems show what others have written on opening.
         return self.file(name, channels=channels)
+
+    def _check(
+        self,
+        file: BrickFile,
+        jobs: list[Job],
+        missing: list[Job],
+        used: dict[str, list[str]],
+    ) -> None:
+        """Raise IrrcacheError if what finished jobs have written to working files, and is still
+        needed by the ``missing`` ones or by the command, has been changed since.
+
+        ``file`` is that of the sweep, which its last jobs write; ``used`` as `_jobs` returns it.
+        """
+        rest, written = {job.name for job in missing}, {}
+        for job in (job for job in jobs if job.name not in rest):
+            digests = self._results.digests(job)
+            if job.kind == "add_axes":
+                found = file.digest(*job.arguments["slices"])
+                require_unchanged(file.path, digests.get(file.path.name, ""), found)
+            else:
+                written |= digests
+        needed = {name for job in missing for name in used.get(job.name, ())}
+        if any(job.kind == "add_axes" for job in missing):
+            needed |= {name for name in written if name.endswith(FOUND)}
+        for name in sorted(needed & written.keys()):
+            require_unchanged(self._folder / name, written[name])
 
     def _jobs(self, plan: SweepPlan) -> tuple[list[Job], dict[str, list[str]]]:
         """Return the jobs of a sweep, and the files by job that nothing else reads."""

@@ -6,10 +6,15 @@ tracks of the batch carry out of the previous step, and the sums of the slabs, t
 before have been added. It writes both anew under other names. So every file is written by one job
 and never changes, a job may be repeated by any worker at any time, and each voxel is added to in
 the order of one machine.
+
+A job returns the digests of what it has written to these files, which are checked before a later
+run continues with them (`require_unchanged`).
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -39,6 +44,8 @@ from mitsuba_irrcache.out_of_core.slabs import Slab, even_slabs
 PAIRS, FEWEST_SLABS = 8, 8
 #: End of the names of files of a `SweepPlan`.
 PLAN = ".plan.npz"
+#: End of the names of files of the irradiance in a slab.
+FOUND = ".found.npy"
 
 
 @dataclass(frozen=True)
@@ -173,7 +180,7 @@ class SlabStep:
 
     def found(self, number: int) -> str:
         """Return the file of the irradiance in a slab."""
-        return f"{self.sweep}-{self.axis}-slab-{number}.found.npy"
+        return f"{self.sweep}-{self.axis}-slab-{number}{FOUND}"
 
     @property
     def _visits(self) -> int:
@@ -219,8 +226,10 @@ def by_length_of_way(steps: list[SlabStep]) -> list[SlabStep]:
     return sorted(steps, key=lambda step: -left[step.name])
 
 
-def cross_slabs(arguments: dict, _: Path) -> None:
-    """Run one step: cross one or two slabs along a batch of ordinates."""
+def cross_slabs(arguments: dict, _: Path) -> dict[str, str]:
+    """Run one step: cross one or two slabs along a batch of ordinates; return the digests of the
+    files that it has written.
+    """
     folder, step = _shared(arguments["folder"]), SlabStep(**arguments["step"])
     plan = SweepPlan.load(folder, step.sweep)
     sweep = plan.sweeps(folder)[step.axis]
@@ -242,19 +251,23 @@ def cross_slabs(arguments: dict, _: Path) -> None:
         # Copied: Dr.Jit would write to the memory of the array itself.
         parts.append(None if name is None else np.array(_mapped(folder / name, shape)))
     sums = sweep.cross(slabs, step.step, pairs, carried, parts)
+    digests = {}
     for number, own in zip(step.numbers, sums, strict=True):
         if step.completes:
             found = sweep.irradiance(own, sweep.box(slabs[number]))
-            _write(folder / step.found(number), found)
+            digests[step.found(number)] = _write(folder / step.found(number), found)
         else:
-            _write(folder / step.sums(number), own)
+            digests[step.sums(number)] = _write(folder / step.sums(number), own)
     if step.step < len(slabs) - 1:
         after = [[[np.array(v) for v in way] for way in carried[i]] for i in pairs]
-        _write(folder / step.faces, np.array(after, np.float32))
+        digests[step.faces] = _write(folder / step.faces, np.array(after, np.float32))
+    return digests
 
 
-def add_axes(arguments: dict, _: Path) -> None:
-    """Add the irradiance of all dominant axes in some slices."""
+def add_axes(arguments: dict, _: Path) -> dict[str, str]:
+    """Add the irradiance of all dominant axes in some slices; return the digest of these slices in
+    the file of the sweep.
+    """
     folder, (first, last) = _shared(arguments["folder"]), arguments["slices"]
     plan = SweepPlan.load(folder, arguments["sweep"])
     total = np.zeros((last - first, *plan.shape[1:], plan.channels), np.float32)
@@ -272,7 +285,22 @@ def add_axes(arguments: dict, _: Path) -> None:
             total[(slice(begin - first, end - first), *own)] += found[begin - lower : end - lower]
     file = BrickFile.existing(folder / plan.name, plan.shape, np.float32, plan.channels)
     file.write((first, 0, 0), total)
+    digest = file.digest(first, last)
     file.close()
+    return {plan.name: digest}
+
+
+def require_unchanged(path: Path, digest: str, found: str | None = None) -> None:
+    """Raise IrrcacheError unless a working file has the ``digest`` of what a finished job wrote.
+
+    ``found`` is that of the part which the job has written, None for the whole file.
+    """
+    try:
+        found = found or _digest(path)
+    except OSError as error:
+        raise _unusable(path, reason(error)) from None
+    if found != digest:
+        raise _unusable(path, "it is damaged: its content is not what was written to it")
 
 
 def slices_of(shape: tuple[int, int, int]) -> list[Slab]:
@@ -299,21 +327,33 @@ def _mapped(path: Path, shape: tuple[int, ...]) -> np.ndarray:
 
 def _unusable(path: Path, why: str) -> IrrcacheError:
     return IrrcacheError(
-        f'the working file "{path}" cannot be used ({why}); remove the folder "{path.parent}" '
-        "and start again."
+        f'the working file "{path}" cannot be used ({why}). Another command may be using the same '
+        f'folder; if none is, remove the folder "{path.parent}" and start again.'
     )
 
 
-def _write(path: Path, values: np.ndarray) -> None:
-    """Write an array, whole or not at all."""
+def _write(path: Path, values: np.ndarray) -> str:
+    """Write an array, whole or not at all; return the SHA-256 of the file."""
+    values, header = np.ascontiguousarray(values), io.BytesIO()
+    description = np.lib.format.header_data_from_array_1_0(values)
+    np.lib.format.write_array_header_1_0(header, description)
     partial = path.with_name(f"{path.name}.{uuid4().hex}.tmp")
     try:
         with open(partial, "wb") as file:
-            values = np.ascontiguousarray(values)
-            header = np.lib.format.header_data_from_array_1_0(values)
-            np.lib.format.write_array_header_1_0(file, header)
+            file.write(header.getbuffer())
             file.write(values.data)  # NumPy's own does not say why it fails
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise IrrcacheError(f'cannot write "{path}": {error.strerror or error}') from None
+    sha = hashlib.sha256(header.getbuffer())
+    sha.update(values.data)
+    return sha.hexdigest()
+
+
+def _digest(path: Path) -> str:
+    sha = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            sha.update(block)
+    return sha.hexdigest()

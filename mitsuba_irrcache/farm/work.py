@@ -24,9 +24,11 @@ from mitsuba_irrcache.farm import volume_jobs
 from mitsuba_irrcache.farm.jobs import (
     Environment,
     UnfitWorkerError,
+    caches_of,
     contents_of,
     difference,
     software,
+    source_digest,
 )
 from mitsuba_irrcache.farm.results import Outcome
 from mitsuba_irrcache.io.images import write_image
@@ -66,7 +68,7 @@ def run_job(kind: str, arguments: dict, environment: Environment) -> Outcome:
         folder = Path(scratch)
         try:
             set_up(environment)
-            KINDS[kind](arguments, folder)
+            digests = KINDS[kind](arguments, folder) or {}
         except UnfitWorkerError as error:
             return Outcome(worker, unfit=str(error))
         except Exception as error:
@@ -77,7 +79,7 @@ def run_job(kind: str, arguments: dict, environment: Environment) -> Outcome:
             for path in sorted(folder.rglob("*"))
             if path.is_file()
         }
-        return Outcome(worker, time.perf_counter() - started, files)
+        return Outcome(worker, time.perf_counter() - started, files, digests)
 
 
 def set_up(environment: Environment) -> None:
@@ -101,6 +103,12 @@ def set_up(environment: Environment) -> None:
     except Exception as error:
         message = original_message(error)
         raise UnfitWorkerError(f"{environment.variant} cannot be used: {message}") from error
+    for module, wanted in environment.sources:
+        if source_digest(module) != wanted:
+            raise UnfitWorkerError(
+                f'it has imported another version of the module "{module}" than the command; give '
+                "it the same files, and start it anew after they were edited"
+            )
 
 
 def cache_part(arguments: dict, folder: Path) -> None:
@@ -116,8 +124,12 @@ def cache_part(arguments: dict, folder: Path) -> None:
     part.save(folder / arguments["file"])
 
 
-def frame(arguments: dict, folder: Path) -> None:
-    """Render an image; the caches of the last frame are used again where they fit."""
+def frame(arguments: dict, folder: Path) -> dict[str, str]:
+    """Render an image; the caches of the last frame are used again where they fit.
+
+    Returns the digests of the cache files of the scene: a frame does not depend on what it writes
+    to them, but it does on what others write later.
+    """
     scene = _loaded(arguments["scene"])
     integrator = scene.integrator()
     sensor, seed, spp = (arguments[name] for name in ("sensor", "seed", "spp"))
@@ -129,6 +141,7 @@ def frame(arguments: dict, folder: Path) -> None:
     about = described(scene, source, sensor, seed, spp) | {"parameters": json.dumps(parameters)}
     names = getattr(scene.integrator(), "aov_names", list)()
     write_image(folder / arguments["file"], image, about, names)
+    return caches_of(arguments["scene"])
 
 
 def _prepare(scene: mi.Scene) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import weakref
 from collections.abc import Iterator, Sequence
@@ -58,7 +59,9 @@ class BrickFile:
     ) -> BrickFile:
         """Open an existing file; raise IrrcacheError if it is missing or has another size."""
         if not path.is_file():
-            raise IrrcacheError(f'the working file "{path}" is missing.')
+            raise IrrcacheError(
+                f'the working file "{path}" is missing; another command may be using its folder.'
+            )
         bytes_there = path.stat().st_size
         file = cls(path, shape, dtype, channels)
         if bytes_there != file._size:
@@ -100,6 +103,16 @@ class BrickFile:
                 brick = self._brick(number).copy()
                 brick[inside] = values[outside]
             os.pwrite(self._file, brick.data.cast("B"), number * self._bytes)
+
+    def digest(self, first: int, last: int) -> str:
+        """Return the SHA-256 of all bricks with voxels in the slices from ``first`` to before
+        ``last``.
+        """
+        _, ny, nx = self._counts
+        sha = hashlib.sha256()
+        for number in range(first // EDGE * ny * nx, -(-last // EDGE) * ny * nx):
+            sha.update(os.pread(self._file, self._bytes, number * self._bytes))
+        return sha.hexdigest()
 
     def _brick(self, number: int) -> np.ndarray:
         data = os.pread(self._file, self._bytes, number * self._bytes)

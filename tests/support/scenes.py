@@ -128,3 +128,36 @@ def load(
 def image(scene: mi.Scene, **options) -> np.ndarray:
     """Return the rendered image, float64."""
     return np.array(mi.render(scene, **options), dtype=np.float64)
+
+
+#: A volume in the file density.npy beside the scene; $light: file of its irradiance.
+VOLUME_IN_FILE = """<scene version="3.0.0">
+    <default name="light" value=""/>
+    <integrator type="irrcache">
+        <integer name="max_depth" value="-1"/>
+        <integer name="cache_spp" value="64"/>
+        <string name="sigma_t_file" value="density.npy"/>
+        <string name="max_memory" value="1GB"/>
+        <string name="irradiance_file" value="$light"/>
+    </integrator>
+    <sensor type="perspective">
+        <film type="hdrfilm">
+            <integer name="width" value="8"/> <integer name="height" value="8"/>
+        </film>
+        <transform name="to_world"> <lookat origin="0, 1, 5" target="0, 0, 0" up="0, 1, 0"/>
+        </transform>
+    </sensor>
+    <shape type="cube">
+        <bsdf type="null"/>
+        <medium name="interior" type="homogeneous">
+            <rgb name="sigma_t" value="1, 1, 1"/>
+            <rgb name="albedo" value="0.9, 0.8, 0.7"/>
+            <float name="scale" value="4"/>
+        </medium>
+    </shape>
+    <emitter type="directional">
+        <vector name="direction" x="0.4" y="-1" z="0.5"/>
+    </emitter>
+    <emitter type="constant"/>
+</scene>
+"""

@@ -18,6 +18,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.io.images import read_image
 from mitsuba_irrcache.io.scene_files import load_scene
+from tests.support.scenes import VOLUME_IN_FILE
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -131,44 +132,12 @@ def test_frames_equal_images_that_are_rendered_one_by_one(tmp_path, capsys):
     assert capsys.readouterr().out == f"3 of 3 frames are in {frames}\n"
 
 
-VOLUME = """<scene version="3.0.0">
-    <default name="light" value=""/>
-    <integrator type="irrcache">
-        <integer name="max_depth" value="-1"/>
-        <integer name="cache_spp" value="64"/>
-        <string name="sigma_t_file" value="density.npy"/>
-        <string name="max_memory" value="1GB"/>
-        <string name="irradiance_file" value="$light"/>
-    </integrator>
-    <sensor type="perspective">
-        <film type="hdrfilm">
-            <integer name="width" value="8"/> <integer name="height" value="8"/>
-        </film>
-        <transform name="to_world"> <lookat origin="0, 1, 5" target="0, 0, 0" up="0, 1, 0"/>
-        </transform>
-    </sensor>
-    <shape type="cube">
-        <bsdf type="null"/>
-        <medium name="interior" type="homogeneous">
-            <rgb name="sigma_t" value="1, 1, 1"/>
-            <rgb name="albedo" value="0.9, 0.8, 0.7"/>
-            <float name="scale" value="4"/>
-        </medium>
-    </shape>
-    <emitter type="directional">
-        <vector name="direction" x="0.4" y="-1" z="0.5"/>
-    </emitter>
-    <emitter type="constant"/>
-</scene>
-"""
-
-
 def test_a_volume_larger_than_memory_is_swept_by_workers_that_are_killed(tmp_path):
     """The irradiance is that of one machine but for rounding, and always the same bits."""
     rng = np.random.default_rng(1)
     np.save(tmp_path / "density.npy", rng.random((72, 64, 80), dtype=np.float32))
     scene, file = tmp_path / "scene.xml", tmp_path / "light.npy"
-    scene.write_text(VOLUME)
+    scene.write_text(VOLUME_IN_FILE)
     process = farm("cache", scene, "-o", file)
     lines_until(process, 9)
     kill_worker(process)

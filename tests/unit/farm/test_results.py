@@ -35,7 +35,7 @@ def test_a_job_is_finished_while_its_inputs_and_files_are_the_same(results):
     results.store(job(1), outcome(1))
     assert results.has(job(1)) and not results.has(job(2))
     assert results.has(replace(job(1), environment=replace(ENVIRONMENT, threads=8)))
-    for changed in ("variant", "modules", "software"):
+    for changed in ("variant", "modules", "software", "sources"):
         other = replace(ENVIRONMENT, **{changed: ("other",)})
         assert not results.has(replace(job(1), environment=other))
     assert not results.has(replace(job(1), arguments={"file": "1.part", "seed": 1}))

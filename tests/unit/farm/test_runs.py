@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,14 @@ from mitsuba_irrcache.scenes import scene_path
 
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.compare.results import Measurement, Snapshot
-from mitsuba_irrcache.farm import runs, studies, work
-from mitsuba_irrcache.farm.results import Outcome
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.farm import runs, studies, volume, work
+from mitsuba_irrcache.farm.cluster import Connection
+from mitsuba_irrcache.farm.results import Outcome, Results
 from mitsuba_irrcache.farm.work import KINDS
 from mitsuba_irrcache.io.images import write_image
+from mitsuba_irrcache.io.scene_files import load_scene
+from tests.support.scenes import VOLUME_IN_FILE
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -41,13 +47,13 @@ class Here:
             scratch = self.folder / f"job-{number}"
             scratch.mkdir()
             try:
-                KINDS[job.kind](job.arguments, scratch)
+                digests = KINDS[job.kind](job.arguments, scratch) or {}
             except RuntimeError as error:
                 failed[job.name] = str(error)
                 continue
             files = [path for path in scratch.rglob("*") if path.is_file()]
             contents = {str(path.relative_to(scratch)): path.read_bytes() for path in files}
-            self.store(job, Outcome("here", files=contents))
+            self.store(job, Outcome("here", files=contents, digests=digests))
         return failed
 
 
@@ -101,3 +107,109 @@ def test_a_reference_whose_jobs_all_fail(here, tmp_path, capsys, monkeypatch):
     assert main(["farm", "reference", copied(tmp_path / "a"), *options]) == 1
     said = capsys.readouterr()
     assert "this integrator cannot render" in said.err and "samples per pixel" not in said.out
+
+
+CACHED = "irrcache{solver=path,resolution=4,cache_spp=16,cache_file=light.cache}"
+
+
+@pytest.fixture
+def frames(here, tmp_path, monkeypatch, capsys):
+    """Return a function that renders frames, with these options, into a folder, and returns the
+    status and the names of jobs that were run.
+    """
+    monkeypatch.chdir(tmp_path)
+    scene, ran = copied(tmp_path / "scene"), []
+
+    class Noting(Here):
+        def run(self) -> dict[str, str]:
+            ran.extend(job.name for job in self.jobs)
+            return super().run()
+
+    monkeypatch.setattr(runs, "Dispatch", Noting)
+
+    def render(*options: str) -> tuple[int, list[str]]:
+        ran.clear()
+        command = ["farm", "frames", scene, "-o", "frames", "--spp", "1", *SMALL, *options]
+        return main(command), list(ran)
+
+    return render
+
+
+def test_frames_follow_the_cache_file_that_they_read(frames, tmp_path):
+    """One that is refined after they were rendered counts, what they write themselves does not."""
+    options = ["--vary", "spp=1,2", "-i", CACHED]
+    both = ["frame-0000", "frame-0001"]
+    assert frames(*options) == (0, both)
+    assert Path("light.cache").exists()
+    assert frames(*options, "--resume") == (0, [])
+    more = CACHED.replace("=16", "=64")
+    refined = load_scene("scene/scene.xml", {"size": "8", "max_depth": "3"}, more)
+    refined.integrator().prepare(refined)
+    before = Path("frames/frame-0001.exr").read_bytes()
+    assert frames(*options, "--resume") == (0, both)
+    assert Path("frames/frame-0001.exr").read_bytes() != before
+    assert frames(*options, "--resume") == (0, [])
+    Path("light.cache").unlink()
+    assert frames(*options, "--resume") == (0, [])
+
+
+def test_no_image_of_other_inputs_stays_beside_those_of_a_run(frames, tmp_path, monkeypatch):
+    """Where a frame fails, also if its record is damaged."""
+    options = ["--vary", "sigma_t=2,3", "-i", "volpath"]
+    assert frames(*options)[0] == 0
+    Path("frames/.farm/frame-0001.json").write_text("")
+    render = work.frame
+
+    def second_fails(arguments, folder):
+        if arguments["scene"]["parameters"]["sigma_t"] != "2":
+            raise RuntimeError("this frame cannot be rendered")
+        return render(arguments, folder)
+
+    monkeypatch.setitem(KINDS, "frame", second_fails)
+    changed = ["--vary", "sigma_t=2,4", "-i", "volpath", "--resume"]
+    assert frames(*changed) == (1, ["frame-0001"])
+    assert sorted(path.name for path in Path("frames").glob("frame*")) == [
+        "frame-0000.exr", "frame-0000.png",
+    ]  # fmt: skip
+
+
+def test_a_run_without_all_its_frames_has_a_status(frames, monkeypatch, capsys):
+    """As where another command, of other inputs, writes to the folder at the same time."""
+    store = Results.store
+    other = {"seed": 5}
+    monkeypatch.setattr(
+        Results,
+        "store",
+        lambda own, job, outcome: store(
+            own, replace(job, arguments=job.arguments | other), outcome
+        ),
+    )
+    assert frames("-i", "volpath")[0] == 1
+    said = capsys.readouterr()
+    assert "0 of 1 frames" in said.out and "another command may be using" in said.err
+
+
+def test_a_parameter_with_one_value_and_one_per_frame_is_refused(frames, capsys):
+    assert frames("-D", "sigma_t=3", "--vary", "sigma_t=1,2") == (1, [])
+    assert '"sigma_t" has the value "3" by -D' in capsys.readouterr().err
+
+
+def test_the_second_of_two_commands_for_one_volume_says_so(tmp_path, monkeypatch, capsys):
+    """The first one has removed the working files when it was finished."""
+    folder = tmp_path / "light.npy.parts"
+
+    class Overtaken:
+        def __init__(self, *_) -> None:
+            shutil.rmtree(next(folder.iterdir()))  # as halfway through the removal
+
+        def run(self) -> None:
+            raise IrrcacheError("some file does not exist")
+
+    monkeypatch.setattr(runs, "connected", lambda _: nullcontext(Connection(None)))
+    monkeypatch.setattr(volume, "Dispatch", Overtaken)
+    np.save(tmp_path / "density.npy", np.ones((8, 8, 8), np.float32))
+    (tmp_path / "scene.xml").write_text(VOLUME_IN_FILE)
+    command = ["farm", "cache", str(tmp_path / "scene.xml"), "-o", str(tmp_path / "light.npy")]
+    assert main(command) == 1
+    said = capsys.readouterr().err
+    assert "light.npy.parts" in said and "by another command" in said

@@ -4,7 +4,9 @@ in whatever order, and however often, jobs are run.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -59,10 +61,10 @@ class Workers:
             job = ready[self.rng.integers(len(ready))]
             if sum(self.runs.values()) >= self.limit:
                 raise KeyboardInterrupt
-            KINDS[job.kind](job.arguments, None)
+            digests = KINDS[job.kind](job.arguments, None)
             self.runs[job.name] += 1
             if self.rng.random() < 0.8:
-                self.store(job, Outcome("here", 1.0))
+                self.store(job, Outcome("here", 1.0, digests=digests))
                 del waiting[job.name]
         return {}
 
@@ -248,6 +250,51 @@ def test_a_damaged_working_file_ends_the_run_with_its_name(
     Damaging(monkeypatch, 2)
     with pytest.raises(IrrcacheError, match=rf"uncollided-.*{kind}\.npy.*remove the folder"):
         both_sweeps(farm_sweep(sigma_t, tmp_path), 4, 1)
+
+
+def uncollided_of(sweep: SlabSweep) -> np.ndarray:
+    directions, _, incoming, offsets = ordinates_of(10, 1)
+    return sweep.uncollided(directions, incoming, offsets).read((0, 0, 0), SHAPE)
+
+
+def changed(content: bytes, how: str) -> bytes:
+    """Return the content of a file with another bit in its values, or zeros of the same size."""
+    at = len(content) // 2
+    return {
+        "a bit": content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :],
+        "zeros": bytes(len(content)),
+        "zeros after the header": content[:128] + bytes(len(content) - 128),
+    }[how]
+
+
+@pytest.mark.parametrize("how", ["a bit", "zeros", "zeros after the header"])
+@pytest.mark.parametrize("kind", ["-*.faces.npy", "-*.sums.npy", "-*.found.npy", ""])
+def test_a_file_that_is_damaged_between_runs_ends_the_next_one_with_its_name(
+    sigma_t, tmp_path, monkeypatch, kind, how
+):
+    """At whatever time the first run ends; where the file is no longer needed, nothing differs."""
+    monkeypatch.setattr(volume_jobs, "FEWEST_SLABS", 3)
+    Workers(monkeypatch, 2)
+    expected = uncollided_of(farm_sweep(sigma_t, tmp_path))
+    refused = 0
+    for limit in (5, 18, 40, 1 << 30):
+        folder = tmp_path / str(limit)
+        folder.mkdir()
+        Workers(monkeypatch, 2, limit)
+        with suppress(KeyboardInterrupt):
+            uncollided_of(farm_sweep(sigma_t, folder))
+        for path in sorted(folder.glob(f"parts/*/uncollided{kind}"))[:1]:
+            path.write_bytes(changed(path.read_bytes(), how))
+        again = Workers(monkeypatch, 2)
+        try:
+            np.testing.assert_array_equal(uncollided_of(farm_sweep(sigma_t, folder)), expected)
+        except IrrcacheError as error:
+            assert re.search(
+                rf'uncollided{kind.replace("*", ".*")}".*remove the folder', str(error)
+            )
+            assert not again.runs
+            refused += 1
+    assert refused
 
 
 def test_a_worker_without_the_folder_is_of_another_kind(tmp_path):

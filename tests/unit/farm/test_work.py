@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
+import importlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from mitsuba_irrcache.compare import reference as stored
 from mitsuba_irrcache.compare.command import common_job
 from mitsuba_irrcache.compare.results import Measurement, Snapshot
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.farm import references, studies, work
+from mitsuba_irrcache.farm import jobs, references, studies, work
 from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
 from mitsuba_irrcache.farm.references import ReferenceRun
 from mitsuba_irrcache.farm.results import Outcome
@@ -83,11 +85,10 @@ def scene(tmp_path):
 def outcome(job: Job, folder: Path) -> Outcome:
     """Run a job as a worker does, in a new ``folder``."""
     folder.mkdir()
-    KINDS[job.kind](job.arguments, folder)
+    digests = KINDS[job.kind](job.arguments, folder) or {}
     files = [path for path in folder.rglob("*") if path.is_file()]
-    return Outcome(
-        "here", files={str(path.relative_to(folder)): path.read_bytes() for path in files}
-    )
+    contents = {str(path.relative_to(folder)): path.read_bytes() for path in files}
+    return Outcome("here", files=contents, digests=digests)
 
 
 @pytest.mark.parametrize(
@@ -103,6 +104,37 @@ def test_a_worker_of_another_kind_says_why(environment, change, said):
     set_up(environment)
     with pytest.raises(UnfitWorkerError, match=said):
         set_up(replace(environment, **change))
+
+
+@pytest.mark.parametrize("is_package", [False, True])
+def test_edits_of_an_imported_module_are_seen(tmp_path, monkeypatch, is_package):
+    """Jobs have other digests, and a worker that has imported it before is of another kind."""
+    monkeypatch.syspath_prepend(tmp_path)
+    name = f"edited_plugin_{is_package}"
+    file = tmp_path / f"{name}.py"
+    if is_package:
+        file = tmp_path / name / "level.py"
+        file.parent.mkdir()
+        (file.parent / "__init__.py").write_text("from . import level\n")
+
+    def imported(content: str) -> Environment:
+        """As in a new process."""
+        file.write_text(content)
+        jobs.source_digest.cache_clear()
+        importlib.import_module(name)
+        return Environment.here("llvm_ad_rgb", [name], 0)
+
+    try:
+        first, again, second = map(imported, ("LEVEL = 1\n", "LEVEL = 1\n", "LEVEL = 2\n"))
+        digests = [Job("a", "frame", {}, each).digest for each in (first, again, second)]
+        assert digests[0] == digests[1] != digests[2]
+        imported("LEVEL = 1\n")
+        file.write_text("LEVEL = 2\n")
+        set_up(first)
+        with pytest.raises(UnfitWorkerError, match=f'another version of the module "{name}"'):
+            set_up(second)
+    finally:
+        jobs.source_digest.cache_clear()
 
 
 def test_a_worker_reads_exr_files_whatever_its_threads(environment, tmp_path):
@@ -142,6 +174,25 @@ def test_frames_share_a_cache_file_in_the_folder_of_the_command(
     assert second.files["frame.png"] == first.files["frame.png"]
     monkeypatch.chdir(tmp_path)
     assert frame_job(scene, integrator, environment, SMALL).digest == job.digest
+
+
+def test_cache_files_of_all_media_and_of_nested_integrators_are_found(scene, tmp_path):
+    """Each by the name that the scene gives, wherever the folder of the command is."""
+    own = '<integrator type="$integrator">\n        <integer name="max_depth" value="$max_depth"/>'
+    assert own in scene.read_text()
+    named = f'<integrator type="aov">{own} <string name="cache_file" value="a/light.cache"/>'
+    text = scene.read_text().replace(own, named).replace("</integrator>", "</integrator>" * 2, 1)
+    scene.write_text(text)
+    arguments = scene_arguments(scene, SMALL, None) | {"folder": str(tmp_path / "command")}
+    assert jobs.caches_of(arguments) == {}
+    (tmp_path / "command" / "a").mkdir(parents=True)
+    for name in ("light.cache", "light.fog.cache", "light2.cache", "light.png"):
+        (tmp_path / "command" / "a" / name).write_text(name)
+    expected = {
+        f"a/{name}": hashlib.sha256(name.encode()).hexdigest()
+        for name in ("light.cache", "light.fog.cache")
+    }
+    assert jobs.caches_of(arguments) == expected
 
 
 def test_frames_that_need_no_cache_are_rendered_without_one(environment, tmp_path):
