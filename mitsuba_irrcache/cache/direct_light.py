@@ -36,6 +36,7 @@ from mitsuba_irrcache.lights.emitters import (
     SPOT_LIKE,
     EmitterKind,
     EmittersByKind,
+    are_distant,
     illuminating,
     kind_of,
     position_of,
@@ -270,7 +271,9 @@ class DirectLight:
         record, _ = self._sample_emitter(p)
         ray = mi.Ray3f(p, record.d)
         hit, near, far = self._medium.intersect(ray)
-        near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
+        near = dr.maximum(near, 0)
+        if not are_distant(self.emitter):
+            far = dr.minimum(far, record.dist)
         return ray, near, dr.select(hit, far, near)
 
     def _mean_unobstructed(self) -> mi.Spectrum:

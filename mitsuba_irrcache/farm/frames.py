@@ -192,8 +192,8 @@ def begin_frames(jobs: list[Job], results: Results) -> list[Job]:
     missing = [job for job in jobs if not (results.has(job) and _has_same_caches(job, results))]
     for job in missing:
         results.remove(job)
-        for file in results.folder.glob(f"{job.name}.*"):  # the record may be damaged
-            file.unlink()
+        # The record may be damaged.
+        (results.folder / job.arguments["file"]).unlink(missing_ok=True)
     return missing
 
 

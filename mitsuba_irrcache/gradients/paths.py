@@ -21,6 +21,7 @@ from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, RaySeg
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     Media,
+    distance_to,
     is_solid,
     position_on,
     power_heuristic,
@@ -244,7 +245,7 @@ class PathAdjoint:
         share = power_heuristic_or_one(record, other)
         scale = irradiance * (visible * share)
         vertex = _Vertex(
-            shadow, record.dist, scale * emitter, record, scale, origin, None, record.d,
+            shadow, distance_to(record), scale * emitter, record, scale, origin, None, record.d,
             mi.Spectrum(1), mi.Bool(True),
         )  # fmt: skip
         dr.eval(vertex.direct, vertex.emitter_weight, vertex.shadow, rng)
@@ -265,7 +266,7 @@ class PathAdjoint:
             self._scene, Media([]), origin, target, none, rng, active, exact=True
         )
         visible = active & (dr.max(passed) > 0)
-        through = self._media.transmittance(shadow, record.dist, visible)
+        through = self._media.transmittance(shadow, distance_to(record), visible)
         return record, emitter, shadow, dr.select(visible, passed * through, 0)
 
     def _segment(
@@ -339,7 +340,7 @@ class PathAdjoint:
             chance = dr.clip(ratio, LEAST_CHANCE, 0.95)
         goes_on = rng.next_float32() < chance
         vertex = _Vertex(
-            shadow, record.dist, scale * emitter * value, record, scale * value,
+            shadow, distance_to(record), scale * emitter * value, record, scale * value,
             mi.Interaction3f(si), si, towards, value, active, found.wo, factor * found.pdf,
         )  # fmt: skip
         active = active & goes_on

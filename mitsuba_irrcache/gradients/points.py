@@ -9,6 +9,7 @@ from mitsuba_irrcache.core.fast_math import minimum
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, summed_to_channels
 from mitsuba_irrcache.gradients.tangent_fields import FieldReader
+from mitsuba_irrcache.lights.emitters import are_distant
 from mitsuba_irrcache.media.medium import MediumGrid
 
 
@@ -39,7 +40,9 @@ def add_paths_to_light(
     record, _ = emitter.sample_direction(at, mi.Point2f(0.5))
     ray = mi.Ray3f(position, record.d)
     hit, near, far = medium.intersect(ray)
-    t, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
+    t = dr.maximum(near, 0)
+    if not are_distant(emitter):
+        far = dr.minimum(far, record.dist)
     active = hit & (t < far) & (dr.max(dr.abs(removed)) > 0)
     while dr.hint(active, label="line to a light"):
         end = minimum(t + step, far)

@@ -286,12 +286,16 @@ def trace_to_infinity(
     return dr.select(escaped, attenuation, 0), radiance, rng
 
 
-def position_on(record: mi.DirectionSample3f, vertex: mi.Interaction3f) -> mi.Point3f:
-    """Return where a shadow ray from ``vertex`` to a sampled emitter ends: beyond all shapes for
-    suns and environments, whose distance follows from the bounding box of the scene, which is too
-    small where Mitsuba has merged meshes (`core/bounds`).
+def distance_to(record: mi.DirectionSample3f) -> mi.Float:
+    """Return the distance of a sampled emitter: beyond all shapes for suns and environments, where
+    Mitsuba's follows from the bounding box of the scene, which may be too small (`core/bounds`).
     """
-    beyond = vertex.p + FAR * record.dist * record.d
+    return dr.select(are_distant(record.emitter), FAR * record.dist, record.dist)
+
+
+def position_on(record: mi.DirectionSample3f, vertex: mi.Interaction3f) -> mi.Point3f:
+    """Return where a shadow ray from ``vertex`` to a sampled emitter ends, see `distance_to`."""
+    beyond = vertex.p + distance_to(record) * record.d
     return dr.select(are_distant(record.emitter), beyond, record.p)
 
 
