@@ -192,8 +192,9 @@ def begin_frames(jobs: list[Job], results: Results) -> list[Job]:
     missing = [job for job in jobs if not (results.has(job) and _has_same_caches(job, results))]
     for job in missing:
         results.remove(job)
-        # The record may be damaged.
-        (results.folder / job.arguments["file"]).unlink(missing_ok=True)
+        image = results.folder / job.arguments["file"]
+        for file in (image, image.with_suffix(".png")):  # the record may be damaged
+            file.unlink(missing_ok=True)
     return missing
 
 
