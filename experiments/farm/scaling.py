@@ -53,6 +53,7 @@ import drjit as dr, mitsuba as mi
 import mitsuba_irrcache
 mi.set_variant("llvm_ad_rgb")
 dr.set_thread_count(1)
+mi.set_log_level(mi.LogLevel.Error)  # the output is read
 from mitsuba_irrcache.io.scene_files import load_scene
 scene = load_scene(sys.argv[1], {}, sys.argv[2])
 started, used = time.perf_counter(), time.process_time()
