@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.jit import concatenated, symbolic
+from mitsuba_irrcache.core.jit import concatenated, opaque_point, symbolic
 
 #: Node number of keys that are not in the table.
 NONE = 0xFFFFFFFF
@@ -107,8 +107,8 @@ class SurfaceNodes:
         origin = 0.5 * (lower + upper) + SHIFT * spacing
         self.spacing = dr.opaque(mi.Float, spacing)
         self._step = ORIGIN_STEP * spacing
-        self._default_origin, self._origin = origin, _opaque(origin)
-        self._lower, self._upper = _opaque(lower), _opaque(upper)
+        self._default_origin, self._origin = origin, opaque_point(origin)
+        self._lower, self._upper = opaque_point(lower), opaque_point(upper)
         self.count = 0
         self.keys = mi.UInt64(0)
         #: per node: position and harmonic mean distance (0 where there is no surface); shading
@@ -123,7 +123,7 @@ class SurfaceNodes:
         """
         if not self.count:
             steps = np.round((np.asarray(p) - self._default_origin) / self._step)
-            self._origin = _opaque(self._default_origin + steps * self._step)
+            self._origin = opaque_point(self._default_origin + steps * self._step)
 
     # Lookup
 
@@ -363,10 +363,6 @@ class SurfaceNodes:
         """Return two random words per node, which depend on its key only."""
         key = dr.gather(mi.UInt64, self.keys, numbers)
         return mi.sample_tea_32(mi.UInt32(key), mi.UInt32(key >> 32))
-
-
-def _opaque(p: np.ndarray) -> mi.Point3f:
-    return mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in p))
 
 
 def _across(

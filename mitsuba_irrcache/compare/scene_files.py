@@ -9,6 +9,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from mitsuba_irrcache.io.files import file_digest
 from mitsuba_irrcache.io.scene_files import WRITTEN, parsed, replace_integrator
 from mitsuba_irrcache.io.zarr_chunks import is_zarr
 
@@ -90,11 +91,7 @@ def _digest(file: Path) -> bytes:
 
 @lru_cache(maxsize=1 << 16)
 def _digest_of(file: Path, size: int, modified: int) -> bytes:
-    sha = hashlib.sha256()
-    with open(file, "rb") as stream:
-        while block := stream.read(1 << 20):
-            sha.update(block)
-    return sha.digest()
+    return file_digest(file)
 
 
 def _is_input(path: Path) -> bool:

@@ -1,9 +1,9 @@
-"""Dr.Jit loops written in Python syntax, integer division by constants, and concatenation."""
+"""Dr.Jit loops written in Python syntax, integer division, opaque points, and concatenation."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 
 import drjit as dr
@@ -75,6 +75,11 @@ def unravelled(index: mi.UInt32, sides: Sequence[Divisor]) -> tuple[mi.UInt32, .
         index, place = side.split(index)
         places.append(place)
     return (*places, index)
+
+
+def opaque_point(values: Iterable[float]) -> mi.Point3f:
+    """Return a point that is an argument of kernels and not a constant in them."""
+    return mi.Point3f([dr.opaque(mi.Float, float(v)) for v in values])
 
 
 def concatenated(parts: Sequence[dr.ArrayBase]) -> dr.ArrayBase:

@@ -28,7 +28,7 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.farm.jobs import UnfitWorkerError
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.io.files import atomic_write
+from mitsuba_irrcache.io.files import atomic_write, file_digest
 from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
 from mitsuba_irrcache.out_of_core.slab_sweep import (
     EXTINCTION_FILE,
@@ -296,7 +296,7 @@ def require_unchanged(path: Path, digest: str, found: str | None = None) -> None
     ``found`` is that of the part which the job has written, None for the whole file.
     """
     try:
-        found = found or _digest(path)
+        found = found or file_digest(path).hex()
     except OSError as error:
         raise _unusable(path, reason(error)) from None
     if found != digest:
@@ -348,12 +348,4 @@ def _write(path: Path, values: np.ndarray) -> str:
         raise IrrcacheError(f'cannot write "{path}": {error.strerror or error}') from None
     sha = hashlib.sha256(header.getbuffer())
     sha.update(values.data)
-    return sha.hexdigest()
-
-
-def _digest(path: Path) -> str:
-    sha = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            sha.update(block)
     return sha.hexdigest()

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.fast_math import clipped
-from mitsuba_irrcache.core.jit import Divisor, unravelled
+from mitsuba_irrcache.core.jit import Divisor, opaque_point, unravelled
 from mitsuba_irrcache.errors import IrrcacheError
 
 
@@ -124,7 +124,7 @@ class Affine:
         linear = self.matrix[:3, :3]
         pivot = -np.linalg.solve(linear, self.matrix[:3, 3])
         self._linear = [[dr.opaque(mi.Float, float(v)) for v in row] for row in linear]
-        self._pivot = mi.Point3f([dr.opaque(mi.Float, float(v)) for v in pivot])
+        self._pivot = opaque_point(pivot)
 
     def point(self, p: mi.Point3f) -> mi.Point3f:
         return mi.Point3f(self.vector(mi.Vector3f(p - self._pivot)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 import threading
@@ -49,6 +50,15 @@ def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
             reason = error.strerror or str(error)
             raise IrrcacheError(f'cannot write "{path}": {reason}.') from error
         raise
+
+
+def file_digest(path: str | os.PathLike) -> bytes:
+    """Return the SHA-256 of the content of a file."""
+    sha = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            sha.update(block)
+    return sha.digest()
 
 
 def check_folder_of(file: Path, name: str) -> None:

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import opaque_point, symbolic
 from mitsuba_irrcache.core.sequences import kronecker_points
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import point_lights, position_of
@@ -50,7 +50,7 @@ class VoxelSamplePoints:
     def __init__(self, scene: mi.Scene, grid: Grid) -> None:
         self.grid = grid
         lamps = [position_of(e) for e in point_lights(scene)]
-        self._lamps = [mi.Point3f([dr.opaque(mi.Float, float(v)) for v in p]) for p in lamps]
+        self._lamps = [opaque_point(p) for p in lamps]
         self._minimum_distance = dr.opaque(
             mi.Float, MINIMUM_DISTANCE * float(grid.voxel_size.min())
         )
@@ -90,7 +90,7 @@ class InverseSquareFactor:
         total = sum(strength for _, strength, _ in points)
         self._points = [
             (
-                mi.Point3f([dr.opaque(mi.Float, float(v)) for v in position]),
+                opaque_point(position),
                 dr.opaque(mi.Float, strength / total * (MOST_DISTANCE * edge) ** 2),
                 dr.opaque(mi.Float, max(squared, (NEAREST * edge) ** 2)),
             )

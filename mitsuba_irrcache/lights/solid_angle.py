@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.jit import opaque_point
 from mitsuba_irrcache.grids.boundary import box_frame, sphere_frame
 from mitsuba_irrcache.grids.grid import Affine
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, varies_in_space
@@ -45,10 +46,10 @@ class SolidAngle:
         self.kind, self.frame = kind, frame
         self.is_flat = kind in ("rectangle", "disk")
         self._world, self._local = Affine(frame), Affine(np.linalg.inv(frame))
-        self._centre = _point(frame[:3, 3])
+        self._centre = opaque_point(frame[:3, 3])
         self._radius = dr.opaque(mi.Float, float(np.linalg.norm(frame[:3, 0])))
         self._polygons = [
-            ([_point(v) for v in corners], _point(front))
+            ([opaque_point(v) for v in corners], opaque_point(front))
             for corners, front in _polygons(kind, frame, normal)
         ]
         self._faces = _faces(kind, frame)
@@ -251,7 +252,7 @@ def _faces(kind: str, frame: np.ndarray) -> list[list[mi.Vector3f | mi.Float]]:
             vectors = centre, np.cross(across, along), across, along
             numbers = half, u @ along, length
             found.append(
-                [mi.Vector3f(_point(value)) for value in vectors]
+                [mi.Vector3f(opaque_point(value)) for value in vectors]
                 + [dr.opaque(mi.Float, float(value)) for value in numbers]
             )
     return found
@@ -272,8 +273,3 @@ def _polygon_solid_angle(corners: list[mi.Point3f], p: mi.Point3f) -> mi.Float:
         y = dr.dot(first, dr.cross(a, b))
         real, imaginary = real * x - imaginary * y, real * y + imaginary * x
     return 2 * dr.abs(dr.atan2(imaginary, real))
-
-
-def _point(values: np.ndarray) -> mi.Point3f:
-    """Return a point with opaque values, so that different values share one kernel."""
-    return mi.Point3f([dr.opaque(mi.Float, float(v)) for v in values])

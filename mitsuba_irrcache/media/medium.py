@@ -11,6 +11,7 @@ import numpy as np
 
 from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.core.immutable import Immutable
+from mitsuba_irrcache.core.jit import opaque_point
 from mitsuba_irrcache.grids.boundary import Boundary, intersect_slabs
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
@@ -110,7 +111,7 @@ class MediumGrid(Immutable):
         self.name, self.context, self.unscaled = name, context, unscaled
         self.macrocells = macrocells or Macrocells.build(sigma_t, boundary)
         if bbox is not None:
-            corners = [mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in p)) for p in bbox]
+            corners = [opaque_point(p) for p in bbox]
             self._clip = mi.BoundingBox3f(*corners)
 
     def replaced(self, **changes: object) -> MediumGrid:

@@ -21,7 +21,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import Scattering
 from mitsuba_irrcache.cache.surface import SpacingBounds, SurfaceNodes
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import opaque_point, symbolic
 from mitsuba_irrcache.lights.emitters import are_distant
 from mitsuba_irrcache.lights.narrow_sources import Source
 from mitsuba_irrcache.render.film import ViewExtent
@@ -116,7 +116,7 @@ class SurfacePaths:
         """Bound the spacing of nodes by what an image shows."""
         self.nodes.set_origin_near(np.array(view.position))
         across = max(COARSEST_IN_VIEW, COARSEST_PIXELS / view.pixels)
-        self._camera = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in view.position))
+        self._camera = opaque_point(view.position)
         # Rays of several sensors start at different positions: this is the least distance.
         self._camera_spread = dr.opaque(mi.Float, view.spread)
         self._view_extent = tuple(
@@ -130,15 +130,13 @@ class SurfacePaths:
         ``travelled`` this distance from a node or from the camera.
         """
         at_sensor, per_distance = self._view_extent
-        if from_node:
-            distance = dr.maximum(dr.norm(p - self._camera) - self._camera_spread, 0)
-        else:
-            distance = travelled
+        if not from_node:
+            coarsest = dr.fma(per_distance, travelled, at_sensor)
+            return SpacingBounds(coarsest, coarsest * self._finest_in_view)
+        distance = dr.maximum(dr.norm(p - self._camera) - self._camera_spread, 0)
         coarsest = dr.fma(per_distance, distance, at_sensor)
-        if from_node:
-            finest = dr.maximum(coarsest * self._finest_from_nodes, FINEST_FROM_NODES * travelled)
-            return SpacingBounds(dr.maximum(coarsest, COARSEST_FROM_NODES * travelled), finest)
-        return SpacingBounds(coarsest, coarsest * self._finest_in_view)
+        finest = dr.maximum(coarsest * self._finest_from_nodes, FINEST_FROM_NODES * travelled)
+        return SpacingBounds(dr.maximum(coarsest, COARSEST_FROM_NODES * travelled), finest)
 
     @property
     def narrow_sources(self) -> tuple[Source, ...]:

@@ -295,7 +295,7 @@ def distance_to(record: mi.DirectionSample3f) -> mi.Float:
 
 def position_on(record: mi.DirectionSample3f, vertex: mi.Interaction3f) -> mi.Point3f:
     """Return where a shadow ray from ``vertex`` to a sampled emitter ends, see `distance_to`."""
-    beyond = vertex.p + distance_to(record) * record.d
+    beyond = vertex.p + FAR * record.dist * record.d
     return dr.select(are_distant(record.emitter), beyond, record.p)
 
 
