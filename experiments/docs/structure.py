@@ -24,7 +24,8 @@ DOCUMENTS = tuple(ROOT / "docs/developing" / name for name in ("structure.md", "
 #: one level do not import each other.
 LEVELS = (
     ("errors",),
-    ("core", "io", "machine"),
+    ("core",),
+    ("io", "machine"),
     ("grids",),
     ("media", "lights"),
     ("transport",),

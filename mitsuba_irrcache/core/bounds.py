@@ -1,8 +1,8 @@
 """Bounding boxes of scenes whose meshes Mitsuba has merged.
 
-On loading, Mitsuba merges meshes that have the same BSDF and media. The result has the bounding box
-of all but the first of them (seen in Mitsuba 3.9), and so has the scene. Suns and environments end
-their shadow rays at the distance of the diameter of the scene's bounding sphere.
+On loading, Mitsuba merges meshes and rectangles that have the same BSDF and media. The bounding
+box of the result lacks the rectangles (seen in Mitsuba 3.9), and so does that of the scene, at
+whose diameter suns and environments end their shadow rays.
 """
 
 from __future__ import annotations

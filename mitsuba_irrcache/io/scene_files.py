@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from xml.etree import ElementTree
 
 import mitsuba as mi
 
+from mitsuba_irrcache.core.bounds import correct_mesh_bounds, lost_extent
 from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.io.scene_xml import scene_element
 from mitsuba_irrcache.io.zarr_chunks import is_zarr
@@ -41,16 +42,45 @@ def load_scene(
     not support them. ``properties`` are set in addition to those that the integrator has.
     ``folder`` is that of relative names of files that are not beside the scene, and of those that
     the integrator writes; "": the working folder. Raises IrrcacheError if the file is missing.
+    Meshes are merged as Mitsuba does by default, unless that loses their extent (`core.bounds`).
     """
     with parsed(path, parameters, folder) as (config, state):
-        mi.parser.transform_all(config, state)
-        if integrator is not None:
-            replace_integrator(state, integrator)
-        for key, value in (properties or {}).items():
-            _integrator_node(state).props[key] = value
-        _place_written_files(state, folder)
-        scene = mi.parser.instantiate(config, state)
-    return scene[0] if isinstance(scene, list) else scene
+
+        def prepare(state: mi.parser.ParserState) -> None:
+            if integrator is not None:
+                replace_integrator(state, integrator)
+            for key, value in (properties or {}).items():
+                _integrator_node(state).props[key] = value
+            _place_written_files(state, folder)
+
+        def parse() -> mi.parser.ParserState:
+            return mi.parser.parse_file(config, str(path), **(parameters or {}))
+
+        return _instantiated(config, state, parse, prepare)
+
+
+def _instantiated(
+    config: mi.parser.ParserConfig,
+    state: mi.parser.ParserState,
+    parse: Callable[[], mi.parser.ParserState],
+    prepare: Callable[[mi.parser.ParserState], None],
+) -> mi.Scene:
+    """Return the scene of a parsed ``state`` that ``prepare`` modifies. Where merged meshes lose
+    their extent, ``parse`` a new state, and return its scene without merging.
+    """
+    for merge in (True, False):
+        config.merge_meshes = merge
+        own = state if merge else parse()
+        mi.parser.transform_all(config, own)
+        prepare(own)
+        scene = mi.parser.instantiate(config, own)
+        scene = scene[0] if isinstance(scene, list) else scene
+        if not isinstance(scene, mi.Scene):
+            break
+        correct_mesh_bounds(scene)
+        if not lost_extent(scene):
+            break
+    return scene
 
 
 @contextmanager
@@ -194,16 +224,18 @@ def scene_of_text(
     Volumes whose file name is a key of ``grids`` use that grid instead of the file.
     """
     config = mi.parser.ParserConfig(mi.variant())
-    state = mi.parser.parse_string(config, text)
-    with _search_path(Path(folder)):
+
+    def parse() -> mi.parser.ParserState:
+        state = mi.parser.parse_string(config, text)
         for node in state.nodes:
             name = node.props.get("filename", None)
             if node.type == mi.ObjectType.Volume and name in (grids or {}):
                 del node.props["filename"]
                 node.props["grid"] = grids[name]
-        mi.parser.transform_all(config, state)
-        scene = mi.parser.instantiate(config, state)
-    return scene[0] if isinstance(scene, list) else scene
+        return state
+
+    with _search_path(Path(folder)):
+        return _instantiated(config, parse(), parse, lambda state: None)
 
 
 def integrator_of(path: str | Path, parameters: dict[str, str] | None = None) -> str:

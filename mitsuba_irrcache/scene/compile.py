@@ -416,10 +416,10 @@ def _warn_of_lost_bounds(scene: mi.Scene) -> None:
     if lost_extent(scene) and any(are_distant(e) for e in scene.emitters()):
         mi.Log(
             mi.LogLevel.Warn,
-            "irrcache: Mitsuba has merged meshes of this scene and lost the bounding box of one of "
-            "them, so that its own integrators miss distant shapes that occlude a sun or an "
-            "environment: images by volpath may be too bright. Those by irrcache are not affected. "
-            "To compare them, load the scene with optimize=False.",
+            "irrcache: Mitsuba has merged meshes of this scene, and lost the bounding boxes of "
+            "rectangles among them, so that its own integrators miss distant shapes that occlude a "
+            "sun or an environment: images by volpath may be too bright. Those by irrcache are not "
+            "affected. To compare them, load the scene with optimize=False.",
         )
 
 

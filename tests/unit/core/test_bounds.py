@@ -11,27 +11,38 @@ from mitsuba_irrcache.core.bounds import bounds_of_shapes, correct_mesh_bounds, 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 
-def cube(x: float) -> dict:
+def shape(kind: str, x: float) -> dict:
     place = mi.ScalarTransform4f().translate([x, 0, 0])
-    return {"type": "cube", "to_world": place, "bsdf": {"type": "diffuse"}}
+    return {"type": kind, "to_world": place, "bsdf": {"type": "diffuse"}}
 
 
-@pytest.mark.parametrize("places", [(0, 9), (9, 0), (-5, 0, 9), (9,)])
-def test_bounds_contain_every_merged_mesh(places):
-    scene = mi.load_dict({"type": "scene"} | {f"cube{n}": cube(x) for n, x in enumerate(places)})
+@pytest.mark.parametrize(
+    ("kinds", "places", "lost"),
+    [
+        (["cube", "cube"], (0, 9), 0),
+        (["rectangle", "cube"], (-9, 0), 9),
+        (["cube", "rectangle"], (0, 9), 9),
+        (["cube", "rectangle", "cube"], (0, 9, 4), 5),
+        (["rectangle", "rectangle"], (0, 9), np.inf),
+        (["rectangle"], (9,), 0),
+    ],
+)
+def test_bounds_contain_every_merged_mesh(kinds, places, lost):
+    shapes = {f"shape{n}": shape(*own) for n, own in enumerate(zip(kinds, places, strict=True))}
+    scene = mi.load_dict({"type": "scene"} | shapes)
     assert len(scene.shapes()) == 1  # otherwise Mitsuba has merged nothing, and nothing is tested
     correct_mesh_bounds(scene)
-    expected = [[min(places) - 1, -1, -1], [max(places) + 1, 1, 1]]
+    depth = max(kind == "cube" for kind in kinds)
+    expected = [[min(places) - 1, -1, -depth], [max(places) + 1, 1, depth]]
     np.testing.assert_allclose(bounds_of_shapes(scene), expected, atol=1e-5)
     box = scene.shapes()[0].bbox()
     np.testing.assert_allclose([np.array(box.min), np.array(box.max)], expected, atol=1e-5)
-    known = np.array([scene.bbox().min, scene.bbox().max])
-    assert lost_extent(scene) == pytest.approx(np.abs(known - expected).max())
+    assert lost_extent(scene) == pytest.approx(lost)
 
 
 def test_bounds_of_unmerged_shapes_are_not_lost():
     sphere = {"type": "sphere", "radius": 3}
-    scene = mi.load_dict({"type": "scene", "a": cube(0), "b": sphere})
+    scene = mi.load_dict({"type": "scene", "a": shape("cube", 0), "b": sphere})
     correct_mesh_bounds(scene)
     assert lost_extent(scene) == 0
     assert lost_extent(mi.load_dict({"type": "scene"})) == 0

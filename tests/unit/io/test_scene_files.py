@@ -11,6 +11,7 @@ from mitsuba_irrcache.io.scene_files import (
     integrator_of,
     load_scene,
     parse_integrator,
+    scene_of_text,
     scene_text,
     unknown_properties,
 )
@@ -176,3 +177,20 @@ def test_properties_are_added_to_those_of_the_integrator(file):
     scene = load_scene(file, integrator="irrcache{step=0.5}", properties={"tolerance": 0.25})
     text = str(scene.integrator())
     assert "step = 0.5" in text and "tolerance = 0.25" in text and "max_depth = 3" in text
+
+
+@pytest.mark.parametrize(("far", "shapes"), [("rectangle", 2), ("cube", 1)])
+@pytest.mark.parametrize("from_text", [False, True])
+def test_meshes_are_merged_unless_the_scene_loses_their_extent(tmp_path, far, shapes, from_text):
+    """Mitsuba's own integrators ignore occluders beyond the bounds of the scene."""
+    objects = "".join(
+        f'<shape type="{kind}"><transform name="to_world"><translate x="{x}"/></transform>'
+        '<ref id="grey"/></shape>'
+        for kind, x in (("cube", 0), (far, 5))
+    )
+    text = f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{objects}</scene>'
+    (tmp_path / "scene.xml").write_text(text)
+    scene = scene_of_text(text, tmp_path) if from_text else load_scene(tmp_path / "scene.xml")
+    box = scene.bbox()
+    np.testing.assert_allclose([np.array(box.min), np.array(box.max)], [[-1] * 3, [6, 1, 1]])
+    assert len(scene.shapes()) == shapes
