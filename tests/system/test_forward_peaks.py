@@ -153,7 +153,9 @@ def test_shadows(kind, objects):
     if objects:
         gloss = {"type": "roughconductor", "alpha": 0.2}
         scene["ball"] = {"type": "sphere", "center": [1, -0.9, 0.3], "radius": 0.3, "bsdf": gloss}
-    mean, block, noise = error(BELOW_THE_CLOUD, 12288, **scene)
+    # With 16 voxels the largest error is 2.4 % beside the ball, with 32 it is 1.2 %.
+    settings = {"resolution": 32} if objects else None
+    mean, block, noise = error(BELOW_THE_CLOUD, 12288, settings, **scene)
     assert noise < 0.006
     assert abs(mean) < 0.01 + noise
     assert block < 0.025 + 2 * noise

@@ -200,14 +200,17 @@ def unfolded(window: Window, folder: str, label: str) -> Window:
 
 
 def use(browser: Browser, view: list[str], seconds: float, seed: int, log: Path) -> Usage:
-    """Use ``irrcache view`` with these arguments for a time; its output goes to ``log``."""
+    """Use ``irrcache view`` with these arguments for a time, not counting rests and the first
+    image; its output goes to ``log``.
+    """
     rng = np.random.default_rng(seed)
     with viewer(view, log) as address:
         user = User(browser, address, rng)
-        usage, began = user.usage, user.began
-        for quarter in range(1, 5):
-            while (passed := time.monotonic() - began) < seconds * quarter / 4:
-                usage.memory.append((passed, viewer_memory()))
+        usage = user.usage
+        for _ in range(4):
+            quarter = time.monotonic()
+            while time.monotonic() - quarter < seconds / 4:
+                usage.memory.append((time.monotonic() - user.began, viewer_memory()))
                 user.act()
             user.rest()
         for window in user.windows:
