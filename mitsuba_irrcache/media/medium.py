@@ -36,6 +36,8 @@ class MediumContext(Immutable):
         detail: how much the incident radiance varies with position and direction; SHARP if
             unknown.
         holds_emitters: whether emitting shapes are in the medium or touch it.
+        object_sizes: second largest sides of the bounding boxes of surfaces, where these boxes lie
+            within that of the medium [scene units].
     """
 
     def __init__(
@@ -49,11 +51,12 @@ class MediumContext(Immutable):
         refracts: bool = False,
         detail: Detail = Detail.SHARP,
         holds_emitters: bool = False,
+        object_sizes: tuple[float, ...] = (),
     ) -> None:
         self.pointer, self.number, self.others = pointer, number, others
         self.is_isolated, self.has_exact_boundary = is_isolated, has_exact_boundary
         self.refracts, self.detail = refracts, detail
-        self.holds_emitters = holds_emitters
+        self.holds_emitters, self.object_sizes = holds_emitters, object_sizes
 
     def among(self, others: tuple[MediumGrid, ...]) -> MediumContext:
         """Return a copy with these ``others``."""
@@ -146,6 +149,11 @@ class MediumGrid(Immutable):
     @property
     def holds_emitters(self) -> bool:
         return self.context.holds_emitters
+
+    @property
+    def object_sizes(self) -> tuple[float, ...]:
+        """See `MediumContext.object_sizes`."""
+        return self.context.object_sizes
 
     @property
     def refracts(self) -> bool:

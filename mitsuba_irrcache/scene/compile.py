@@ -145,11 +145,27 @@ def _holds_emitters(scene: mi.Scene, frame: np.ndarray) -> bool:
     """Return whether the bounding box of any emitting shape meets that of the cube [-1, 1]^3 mapped
     by ``frame``.
     """
-    reach = np.abs(frame[:3, :3]).sum(axis=1)
-    lower, upper = frame[:3, 3] - reach, frame[:3, 3] + reach
     shapes = (emitter.get_shape() for emitter in scene.emitters())
-    boxes = (shape.bbox() for shape in shapes if shape is not None)
-    return any((np.array(b.min) <= upper).all() and (np.array(b.max) >= lower).all() for b in boxes)
+    return any((_sides_within(shape, frame) >= 0).all() for shape in shapes if shape is not None)
+
+
+def _object_sizes(scene: mi.Scene, frame: np.ndarray) -> tuple[float, ...]:
+    """Return `MediumContext.object_sizes` for a medium in the cube [-1, 1]^3 mapped by ``frame``.
+
+    The second largest side, so that neither the length of a rod nor the thickness of a sheet
+    counts.
+    """
+    sides = (_sides_within(shape, frame) for shape in scene.shapes() if is_surface(shape))
+    return tuple(sorted({float(np.sort(s)[1]) for s in sides if (s >= 0).all()}))
+
+
+def _sides_within(shape: mi.Shape, frame: np.ndarray) -> np.ndarray:
+    """Return the sides (3) of the intersection of the bounding boxes of a shape and of the cube
+    [-1, 1]^3 mapped by ``frame``; negative ones if they do not meet.
+    """
+    reach = np.abs(frame[:3, :3]).sum(axis=1)
+    lower = np.maximum(np.array(shape.bbox().min), frame[:3, 3] - reach)
+    return np.minimum(np.array(shape.bbox().max), frame[:3, 3] + reach) - lower
 
 
 def _has_surfaces(scene: mi.Scene) -> bool:
@@ -201,6 +217,7 @@ def _baked(
                 refracts=any(refracts(shape) for shape in filled),
                 detail=_detail(scene, emission, max_depth) if is_isolated else Detail.SHARP,
                 holds_emitters=_holds_emitters(scene, boundary.to_world),
+                object_sizes=_object_sizes(scene, boundary.to_world),
             ),
         )
         grids.append(grid)

@@ -171,3 +171,27 @@ def test_shapes_without_sampled_positions_are_described(scenes):
     }
     scene = scenes.load({"type": "volpath"}, scenes.boundary(scenes.medium(1.0, 0.5)), **objects)
     assert len(compile_scene(scene).visible) == 1
+
+
+def test_sizes_of_objects_are_those_within_the_medium(scenes):
+    """Neither the length of a rod nor the thickness of a sheet is the size of an object."""
+
+    def placed(*scale: float) -> object:
+        return mi.ScalarTransform4f().translate((0.5, 0.5, 0.5)).scale(scale)
+
+    bsdf = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    rod = {"type": "cylinder", "p0": [0.5, 0.5, 0], "p1": [0.5, 0.5, 1], "radius": 0.05}
+    objects = {
+        "floor": {"type": "rectangle", "to_world": placed(9, 0.2, 1), "bsdf": bsdf},
+        "rod": rod | {"bsdf": bsdf},
+        "outside": {"type": "sphere", "center": [3, 0, 0], "radius": 0.5, "bsdf": bsdf},
+    }
+    box = {
+        "type": "cube",
+        "to_world": placed(0.5, 0.5, 0.5),
+        "bsdf": {"type": "null"},
+        "interior": {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5},
+    }
+    description = compile_scene(mi.load_dict({"type": "scene", "box": box} | objects))
+    (medium,) = description.visible
+    np.testing.assert_allclose(medium.object_sizes, [0.1, 0.4], rtol=1e-5)

@@ -118,6 +118,27 @@ def test_resolution_depends_on_where_collisions_happen():
     assert chosen(values) == (64, 64, 64)
 
 
+@pytest.mark.parametrize(
+    ("sizes", "data", "expected"),
+    [
+        ((), 1, 50),
+        ((6.0,), 1, 71),  # an object of 6 % of the side in a haze of optical depth 10
+        ((6.0, 60.0), 1, 71),
+        ((60.0,), 1, 50),  # voxels resolve it already
+        ((4.0,), 1, 50),  # smaller than is considered
+        ((6.0,), 4, 64),  # it may lie in a part of the data that is empty
+    ],
+)
+def test_voxels_resolve_the_shadows_of_objects(sizes, data, expected):
+    """A floor of three voxels in homogeneous haze, seen from close by, had an error of 3 %."""
+    values = np.full((data,) * 3, 0.1)
+    haze = medium(values, (100.0,) * 3).replaced(context=MediumContext(object_sizes=sizes))
+    if data == 1:
+        haze = haze.replaced(sigma_t=ConstantField(np.array([0.1])))
+    shape = choose_grid(haze, 0, solver_named("sweep").size_rule)[0].shape
+    assert shape == (expected,) * 3
+
+
 def test_finer_voxels_have_a_limit(monkeypatch):
     monkeypatch.setattr(grid_size, "MOST_REFINED", 70000)
     assert chosen(in_air(40, 40 * 59.0)) == (41, 41, 41)
