@@ -2,12 +2,14 @@
 
     python -m experiments.farm.scaling [--rounds 2] [--force] [--document docs/how-to/farm.md]
 
-A ball of fog under a sun, by both solvers, with one thread of Dr.Jit per process. Processor time
-per job, the median of several: in one process without any farm; in the function that a worker runs;
-of Dask for a job that does nothing, but returns as many bytes; of the command, which stores the
-result and adds it to the cache. Processor time depends less than seconds do on what else the
-machine does. Beside it the seconds of many jobs from the first to the last, of several rounds the
-least. Writes output/farm/scaling.json.
+A ball of fog under a sun, by both solvers. Each worker has one thread of Dr.Jit, and the processes
+of a run as many cores as workers: the thread that records kernels executes them, too, so that a
+process with one thread of Dr.Jit uses up to two cores. Processor time per job, the median of
+several: in one process without any farm; in the function that a worker runs; of Dask for a job that
+does nothing, but returns as many bytes; of the command, which stores the result and adds it to the
+cache. Processor time depends less than seconds do on what else the machine does. Beside it the
+seconds of many jobs from the first to the last, of several rounds the least. Writes
+output/farm/scaling.json.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -67,8 +71,12 @@ def measure(kind: str, rounds: int) -> dict:
     """Return processor times per job, and seconds of all by numbers of workers."""
     settings = KINDS[kind]
     worker, store, size = _parts(settings)
-    alone = [_alone(settings) for _ in range(rounds)]
-    farmed = {str(n): min(_farmed(n, settings) for _ in range(rounds)) for n in WORKERS}
+    with _cores(1):
+        alone = [_alone(settings) for _ in range(rounds)]
+    farmed = {}
+    for n in WORKERS:
+        with _cores(n):
+            farmed[str(n)] = min(_farmed(n, settings) for _ in range(rounds))
     return {
         "alone": min(used for _, used in alone) / JOBS,
         "worker": worker,
@@ -77,6 +85,18 @@ def measure(kind: str, rounds: int) -> dict:
         "seconds": {"none": min(seconds for seconds, _ in alone)} | farmed,
         "load": load(),
     }
+
+
+@contextmanager
+def _cores(count: int) -> Iterator[None]:
+    """Start processes on so many cores within this context."""
+    own = psutil.Process()
+    everything = own.cpu_affinity()
+    own.cpu_affinity(everything[:count])
+    try:
+        yield
+    finally:
+        own.cpu_affinity(everything)
 
 
 def _parts(settings: dict) -> tuple[float, float, int]:
@@ -151,7 +171,7 @@ def table(rows: dict[str, dict]) -> Table:
         "storing, adding",
         "efficiency",
         "workers for one command",
-        f"{JOBS} jobs: one process, 1, 2 workers",
+        f"{JOBS} jobs: one process, 1 worker (1 core), 2 workers (2 cores)",
     ]
     cells = []
     for kind, row in rows.items():
