@@ -44,7 +44,12 @@ class ImageRenderer:
         weight: mi.Spectrum,
         active: mi.Bool,
     ) -> tuple[mi.Spectrum, mi.Float, Layers | None]:
-        """Return radiance times ``weight``, alpha, and the layers of the radiance if required."""
+        """Return radiance times ``weight``, alpha, and the layers of the radiance if required.
+
+        Raises UnsupportedSceneError if rays start in a ``medium`` without a cache.
+        """
+        if isinstance(medium, mi.Medium):  # not an array of pointers to media
+            _check_medium(camera_rays, medium, "rays start")
         view = camera_rays.sample(scene, sampler, mi.Ray3f(ray), medium, active)
         layers = None
         if self._layered:
@@ -65,12 +70,8 @@ class ImageRenderer:
         """Render the film of ``sensor``."""
         medium = sensor.get_medium()
         check_sensor(scene, sensor)  # the sensor may have moved, or may not belong to the scene
-        if medium is not None and not camera_rays.shows(medium):
-            raise UnsupportedSceneError(
-                f'irrcache: sensor "{sensor.id()}" is in medium "{medium.id()}", which is rendered '
-                "for none of the sensors of the scene and has no cache. Add the sensor to the "
-                'scene, or render this image with "volpath".'
-            )
+        if medium is not None:
+            _check_medium(camera_rays, medium, f'sensor "{sensor.id()}" is')
 
         def radiance(sampler, ray, weight, active) -> tuple:
             found = self.sample(camera_rays, scene, sampler, ray, medium, weight, active)
@@ -131,3 +132,13 @@ class ImageRenderer:
         self.seconds = {"filter": perf_counter() - started}
         aovs = dict(zip(self.aov_names(), self.aov_values(layers), strict=True))
         fill_film(film, layers.radiance(filtered), alpha, aovs)
+
+
+def _check_medium(camera_rays: CameraRays, medium: mi.Medium, what: str) -> None:
+    """Raise UnsupportedSceneError if rays cannot start in ``medium``; ``what`` begins a clause."""
+    if not camera_rays.shows(medium):
+        raise UnsupportedSceneError(
+            f'irrcache: {what} in medium "{medium.id()}", which is rendered for none of the '
+            "sensors of the scene and has no cache. Add the sensor to the scene, or render this "
+            'image with "volpath".'
+        )

@@ -314,3 +314,8 @@ def test_sensors_in_media_that_are_not_rendered_are_refused(scenes):
     sensor = mi.load_dict({"type": "perspective", "to_world": place, "medium": medium})
     with pytest.raises(RuntimeError, match="is rendered for none of the sensors"):
         mi.render(scene, sensor=sensor, spp=1)
+    ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(4, 0, 0), mi.Vector3f(0, 0, 1)))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 1)
+    with pytest.raises(IrrcacheError, match="which is rendered for none"):
+        scene.integrator().sample(scene, sampler, ray, medium)
