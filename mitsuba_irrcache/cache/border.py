@@ -361,8 +361,14 @@ def _depth_table() -> tuple[np.ndarray, float, float]:
 
 def _exponential_integrals(x: float) -> tuple[float, float]:
     """Return E_2(x) and E_3(x)."""
-    nodes, weights = np.polynomial.legendre.leggauss(64)
-    t = 0.5 * (nodes + 1)
-    mu, weights = t**3, 1.5 * t**2 * weights
+    mu, weights = _nodes_of_exponential_integrals()
     e2 = float(weights @ np.exp(-x / mu))
     return e2, 0.5 * (float(np.exp(-x)) - x * e2)
+
+
+@cache
+def _nodes_of_exponential_integrals() -> tuple[np.ndarray, np.ndarray]:
+    """Return cosines and weights, which take most of a millisecond and are needed 12800 times."""
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    t = 0.5 * (nodes + 1)
+    return t**3, 1.5 * t**2 * weights
