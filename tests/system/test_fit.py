@@ -15,6 +15,7 @@ from mitsuba_irrcache.gradients.fit import _roughness, fit
 from mitsuba_irrcache.gradients.fit_state import Result, Settings, View
 from mitsuba_irrcache.io.mitsuba_vol import read_vol, write_vol
 from tests.support.scene_xml import FOG_IN_A_BOX
+from tests.support.slow import with_slow
 
 CASE = Case(data=8, cache=8, depth=0.5)
 ORIGINS = ([5.0, 1.0, 0.0], [0.0, 2.0, 5.0], [-4.0, 1.0, -3.0], [1.0, -4.0, 3.0])
@@ -46,7 +47,10 @@ def started(case: Case = CASE, **start: float) -> mi.Scene:
     return scene
 
 
-@pytest.mark.parametrize(("method", "steps"), [("adam", 40), ("lbfgs", 12)])
+# `test_the_command_fits_and_continues` has adam.
+@pytest.mark.parametrize(
+    ("method", "steps"), with_slow([("adam", 40), ("lbfgs", 12)], ("adam", 40))
+)
 def test_a_fit_explains_views_that_it_does_not_see(mono, method, steps):
     if method == "lbfgs":
         pytest.importorskip("scipy")
@@ -90,6 +94,8 @@ def test_a_fit_may_start_without_matter_and_find_the_albedo_too(rgb):
     np.testing.assert_array_equal(np.array(mi.traverse(scene)[key]), albedo)
 
 
+# Gradients of such media are compared with differences in `test_gradients`.
+@pytest.mark.slow
 def test_a_fit_of_a_medium_that_scatters_forwards(mono):
     case = replace(CASE, data=6, g=0.7, emitters=lambda: {"sun": SUN})
     seen, settings = views(case), Settings(steps=10)

@@ -29,14 +29,16 @@ def fewer_paths(monkeypatch):
     monkeypatch.setattr(surroundings, "EXCHANGED", 1 << 16)
 
 
+# Of what `make stress` runs, the floor and a sun are in the test in colour, a window in that of
+# panes, and a distant object in `test_a_distant_object_changes_nothing`.
 @pytest.mark.parametrize(
     ("name", "parameters"),
     [
-        ("ground, sky", ("sigma_t", "floor")),
+        pytest.param("ground, sky", ("sigma_t", "floor"), marks=pytest.mark.slow),
         pytest.param("lamp", ("albedo", "lamp"), marks=pytest.mark.slow),
         ("two media, sky", ("sigma_t", "other.interior_medium.sigma_t")),
-        ("distant object, empty voxels", ("sigma_t",)),
-        ("ground, sun through a window", ("sigma_t",)),
+        pytest.param("distant object, empty voxels", ("sigma_t",), marks=pytest.mark.slow),
+        pytest.param("ground, sun through a window", ("sigma_t",), marks=pytest.mark.slow),
     ],
 )
 def test_gradients_are_those_of_the_image(mono, name, parameters):

@@ -158,11 +158,15 @@ SCENES = {
 }
 
 
-# The closed room takes most of a minute; `test_surfaces_among_voxels` has closed rooms with nodes.
+#: The closed room takes most of a minute; `test_surfaces_among_voxels` has closed rooms with nodes.
+#: The still life has the objects of the others, beside a medium instead of in it.
+SLOW = "room", "still life", "contact, two-sided"
+
+
 @pytest.mark.parametrize(
     ("build", "options"),
     [
-        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name == "room"))
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name in SLOW))
         for name, case in SCENES.items()
     ],
 )
