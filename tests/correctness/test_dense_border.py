@@ -18,11 +18,12 @@ from experiments.validation.dense_faces.run import (
     single_scattering,
 )
 from mitsuba_irrcache.cache import border
+from tests.support.slow import with_slow
 
 pytestmark = pytest.mark.usefixtures("mono")
 
 
-@pytest.mark.parametrize("mu", [1.0, 0.5])
+@pytest.mark.parametrize("mu", with_slow([1.0, 0.5], 1.0))
 @pytest.mark.parametrize(
     ("albedo", "max_depth", "depth", "bound"),
     [
@@ -83,7 +84,7 @@ def thin_plate(thickness: float, depth: float, albedo: float, mu: float, **integ
     return float(face({"type": "irrcache"} | integrator, body, mu, SPP, half=0.25).mean())
 
 
-@pytest.mark.parametrize("mu", [1.0, 0.5])
+@pytest.mark.parametrize("mu", with_slow([1.0, 0.5], 1.0))
 @pytest.mark.parametrize("depth", [2.0, 6.0])
 @pytest.mark.parametrize("thickness", [1 / 64, 1 / 16])
 def test_thin_plate(thickness, depth, mu):

@@ -180,7 +180,7 @@ def loaded(scenes, phase: dict, **settings) -> mi.Scene:
     return scenes.load(integrator, shape, 8, default_solver="path")
 
 
-@pytest.mark.parametrize(("g", "lamps"), [(0.85, 9), (0.85, 8), (0.5, 9)])
+@pytest.mark.parametrize(("g", "lamps"), with_slow([(0.85, 9), (0.85, 8), (0.5, 9)], (0.5, 9)))
 def test_sharp_shadows_on_surfaces_are_announced(scenes, monkeypatch, g, lamps):
     """A forward peak counts as unscattered if there are more lamps than are treated as narrow."""
     messages = []

@@ -301,6 +301,8 @@ def test_sampled_emitters_have_the_mean_of_the_closed_form(tmp_path, max_depth):
     assert means[1] == pytest.approx(means[0], rel=0.004)
 
 
+# `test_sweep_with_surfaces` compares both solvers under a lamp in a room, layer by layer.
+@pytest.mark.slow
 @pytest.mark.usefixtures("mono")
 def test_all_orders_do_not_depend_on_the_solver(scenes):
     """Both solvers scatter the same irradiance further."""

@@ -58,7 +58,7 @@ def test_hidden_lamps_do_not_hide_the_medium(mono):
     place = mi.ScalarTransform4f().look_at(0.9 * camera, 0 * camera, [0, 1, 0]).scale(0.3)
     lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": 1e-4}}
     found = []
-    for objects in (distant, lambda: distant() | {"front": lamp}):
+    for objects in (dict, lambda: {"front": lamp}):
         scene = Case(objects=objects).load(hide_emitters=True)
         found.append(gradients(scene, ("sigma_t",), pixel_weights(scene))["sigma_t"])
     smooth = np.array(Case().sigma_t(), dtype=np.float64)
@@ -66,7 +66,11 @@ def test_hidden_lamps_do_not_hide_the_medium(mono):
     assert hidden == pytest.approx(alone, rel=0.05)
 
 
-@pytest.mark.parametrize("opacity", [None, 0.4], ids=["thindielectric", "mask"])
+@pytest.mark.parametrize(
+    "opacity",
+    [None, pytest.param(0.4, marks=pytest.mark.slow)],
+    ids=["thindielectric", "mask"],
+)
 def test_emitters_stay_hidden_behind_panes(mono, opacity):
     """Images depend linearly on the sky's radiance, and do not show a hidden sky behind a pane, but
     gradients counted it: they were 8 to 20 times too large.

@@ -266,7 +266,7 @@ def test_parameters_assigned_together_change_the_image_by_sweep(scenes, world):
     np.testing.assert_array_equal(found, edited_image(loaded(scenes, world, "sweep"), given))
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", with_slow(WORLDS, "surfaces"))
 def test_arrays_edited_in_place_change_the_image(scenes, world):
     """Edits in place by ``dr.scatter``, as documented by Mitsuba, change the image."""
     scene = loaded(scenes, world, "path")

@@ -368,6 +368,8 @@ def test_an_image_of_few_samples_is_path_traced(scenes, monkeypatch):
     np.testing.assert_array_equal(scenes.image(scene, spp=4), few)
 
 
+# `tests/unit/pipeline/test_scenes_are_freed.py` checks that nothing holds objects of a scene.
+@pytest.mark.slow
 def test_another_scene_may_follow_with_volpath(scenes):
     """Nothing keeps emitters of a scene that is gone: Dr.Jit would call them without shapes."""
     scenes.image(scene_of(scenes, room()), spp=1)

@@ -143,8 +143,16 @@ SCENES = {
 
 
 #: Scenes of `make stress`. `test_area_lights` has lamps in media, `test_volpath` cameras in media,
-#: `test_surfaces_among_voxels` mirrors, `test_sweep_with_surfaces` points and the ground.
-SLOW = "ground and mirror", "lamp inside", "bulb inside", "camera inside"
+#: `test_surfaces_among_voxels` mirrors, `test_sweep_with_surfaces` points and the ground,
+#: `test_media_behind_glass` glass boundaries; media in coloured extinction are nested below.
+SLOW = (
+    "ground and mirror",
+    "lamp inside",
+    "bulb inside",
+    "camera inside",
+    "glass boundary",
+    "three media",
+)
 
 
 @pytest.mark.parametrize(("build", "settings", "bounds"), with_slow(SCENES, *SLOW))

@@ -196,7 +196,8 @@ def test_white_furnace(scenes, around, tolerance):
     assert np.sqrt(((phi - 1) ** 2).mean()) < 0.03
 
 
-@pytest.mark.parametrize("size", [0.4, 2.4])
+# `test_surfaces_among_voxels` has luminous walls and balls that tracks hit.
+@pytest.mark.parametrize("size", with_slow([0.4, 2.4], 2.4))
 def test_small_and_large_emitters_agree_with_path(scenes, size):
     """Both layers of the cache agree with ``path`` for small and large area lights.
 

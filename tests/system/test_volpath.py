@@ -194,7 +194,7 @@ def _bright_window() -> np.ndarray:
 
 # Emitters of all kinds are compared with exact references in `test_convergence_to_references`,
 # environment maps with volpath in `test_anisotropic_scattering`.
-@pytest.mark.parametrize("emitter", with_slow(EMITTERS, "envmap", "point outside", "spot"))
+@pytest.mark.parametrize("emitter", with_slow(EMITTERS, *EMITTERS))
 def test_emitters(scenes, compare, emitter):
     """Each kind of emitter agrees; sharp shadows require more voxels and shorter steps than a
     sky.

@@ -64,7 +64,7 @@ def squares(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("document", "position"),
     [
-        ("cloud", (0.5, -5.0, 1.5)),
+        pytest.param("cloud", (0.5, -5.0, 1.5), marks=pytest.mark.slow),
         ("cloud", (0.1, -0.4, 0.2)),
         ("cloud over the ground", (0.5, -5.0, 1.5)),
     ],
