@@ -23,7 +23,7 @@ paper: setup ## compute the paper's figures and tables, 20 minutes; FULL=1: the 
 test: setup ## run the tests, two at a time: much of each is Python's
 	$(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --no-loadscope-reorder --durations 25
 
-stress: setup ## run the slow tests, try every hazard and fault, 20 minutes; ends with tables of what held
+stress: setup ## run the slow tests, try every hazard and fault, 40 minutes; ends with tables of what held
 	@status=0; $(BIN)/python -m pytest -m slow || status=1; \
 	for part in stability faults; do $(BIN)/python -m experiments.robustness.$$part.run || status=1; done; \
 	exit $$status

@@ -7,7 +7,10 @@ import os
 from pathlib import Path
 from types import SimpleNamespace
 
-from tests.support.compilation import shorten_compilation  # isort: skip (before Dr.Jit)
+from tests.support.compilation import (  # isort: skip (before Dr.Jit)
+    shorten_compilation,
+    without_skipped,
+)
 
 import drjit as dr
 import mitsuba as mi
@@ -69,6 +72,14 @@ def _everything_is_collected():
 def pytest_runtest_teardown(item, nextitem):
     """Tell `mono` about the next test."""
     item.next_fixtures = () if nextitem is None else nextitem.fixturenames
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Leave out of a failed test's output what LLVM prints about passes that it skips."""
+    report = yield
+    report.sections = [(name, without_skipped(text)) for name, text in report.sections]
+    return report
 
 
 @pytest.fixture

@@ -18,11 +18,12 @@ from experiments.validation.dense_faces.run import (
     single_scattering,
 )
 from mitsuba_irrcache.cache import border
+from tests.support.slow import with_slow
 
 pytestmark = pytest.mark.usefixtures("mono")
 
 
-@pytest.mark.parametrize("mu", [1.0, 0.5])
+@pytest.mark.parametrize("mu", with_slow([1.0, 0.5], 1.0))
 @pytest.mark.parametrize(
     ("albedo", "max_depth", "depth", "bound"),
     [
@@ -83,7 +84,7 @@ def thin_plate(thickness: float, depth: float, albedo: float, mu: float, **integ
     return float(face({"type": "irrcache"} | integrator, body, mu, SPP, half=0.25).mean())
 
 
-@pytest.mark.parametrize("mu", [1.0, 0.5])
+@pytest.mark.parametrize("mu", with_slow([1.0, 0.5], 1.0))
 @pytest.mark.parametrize("depth", [2.0, 6.0])
 @pytest.mark.parametrize("thickness", [1 / 64, 1 / 16])
 def test_thin_plate(thickness, depth, mu):
@@ -101,8 +102,14 @@ def test_thin_plate(thickness, depth, mu):
     assert thin_plate(thickness, depth, 0.8, mu, max_depth=2) == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize("mu", [1.0, 0.5])
-@pytest.mark.parametrize("albedo", [0.5, 0.95])
+# The one with the most orders of scattering, seen obliquely.
+@pytest.mark.parametrize(
+    ("albedo", "mu"),
+    [
+        (0.95, 0.5),
+        *(pytest.param(*p, marks=pytest.mark.slow) for p in ((0.95, 1.0), (0.5, 0.5), (0.5, 1.0))),
+    ],
+)
 def test_thin_plate_with_all_orders(albedo, mu):
     """All orders in a thin plate at default settings agree with 24 voxels across."""
     expected = thin_plate(1 / 16, 2.0, albedo, mu, resolution=384)
@@ -203,7 +210,9 @@ def test_window_of_an_environment_map(depth, incident, mu):
     assert image.mean() == pytest.approx(expected, rel=0.025)
 
 
-@pytest.mark.parametrize(("albedo", "bound"), [(0.5, 0.011), (0.9, 0.01)])
+@pytest.mark.parametrize(
+    ("albedo", "bound"), [pytest.param(0.5, 0.011, marks=pytest.mark.slow), (0.9, 0.01)]
+)
 def test_cube_under_a_sun(albedo, bound):
     """A cube of 0.5 optical depths per voxel under a sun agrees with one of four times as many
     voxels, in means over 8 x 8 pixels.

@@ -11,10 +11,11 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 @pytest.mark.parametrize(
     ("name", "body", "bound"),
+    # One map with a part that is much brighter than the rest, and one without.
     [
         ("bright block", "ball of depth 40", 0.9),
-        ("window", "ball of depth 40", 1.4),
-        ("upper half", "cube of depth 20", 0.6),
+        pytest.param("window", "ball of depth 40", 1.4, marks=pytest.mark.slow),
+        pytest.param("upper half", "cube of depth 20", 0.6, marks=pytest.mark.slow),
         ("texture", "smoke of depth 2", 0.3),
     ],
 )

@@ -8,6 +8,7 @@ import pytest
 
 from mitsuba_irrcache.errors import CacheFileError
 from mitsuba_irrcache.solvers.discrete_ordinates import solver
+from tests.support.slow import with_slow
 from tests.support.surfaces import bound, check, diffuse, fog, ground, images, lamp
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -40,9 +41,11 @@ SCENES = {
 }
 BY_PATH = "hg 0.3, single", "hg 0.5, sun of an envmap"
 CASES = [("sweep", name) for name in SCENES] + [("path", name) for name in BY_PATH]
+#: Between cases with the same sky, or the same map, and smaller and larger g.
+SLOW = [("sweep", name) for name in ("hg 0.5", "hg 0.75", "hg 0.5, sun of an envmap")]
 
 
-@pytest.mark.parametrize(("solver", "name"), CASES)
+@pytest.mark.parametrize(("solver", "name"), with_slow(CASES, *SLOW))
 def test_phase_functions(scenes, solver, name):
     phase, depth, lights, bounds = SCENES[name]
     lights = envmap(800.0) if lights == "envmap" else lights
@@ -61,7 +64,7 @@ def two_kinds(scenes) -> dict:
     }
 
 
-@pytest.mark.parametrize("solver", ["path", "sweep"])
+@pytest.mark.parametrize("solver", with_slow(["path", "sweep"], "path"))
 def test_two_media_of_two_kinds(scenes, solver):
     depth, ours = {"max_depth": -1, "rr_depth": 50}, {"solver": solver}
     check(*images(scenes, two_kinds(scenes), ours, depth, (64, 256)))
@@ -107,7 +110,9 @@ def test_with_surfaces(scenes, build, depth, bounds):
     check(*images(scenes, build(scenes), ours, depths, (64, 512)), **bounds)
 
 
-@pytest.mark.parametrize("extinction", [(1.0, 1.0, 1.0), (0.4, 1.5, 3.0)])
+@pytest.mark.parametrize(
+    "extinction", [pytest.param((1.0, 1.0, 1.0), marks=pytest.mark.slow), (0.4, 1.5, 3.0)]
+)
 def test_lamps_of_two_colours_add_up(extinction):
     """The image under two lamps, each of a colour of its own, is the sum of those under one."""
     medium = fog(extinction) | {"phase": hg(0.5)}
@@ -175,7 +180,7 @@ def loaded(scenes, phase: dict, **settings) -> mi.Scene:
     return scenes.load(integrator, shape, 8, default_solver="path")
 
 
-@pytest.mark.parametrize(("g", "lamps"), [(0.85, 9), (0.85, 8), (0.5, 9)])
+@pytest.mark.parametrize(("g", "lamps"), with_slow([(0.85, 9), (0.85, 8), (0.5, 9)], (0.5, 9)))
 def test_sharp_shadows_on_surfaces_are_announced(scenes, monkeypatch, g, lamps):
     """A forward peak counts as unscattered if there are more lamps than are treated as narrow."""
     messages = []

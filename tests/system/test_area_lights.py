@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.cache import area_light
+from tests.support.slow import with_slow
 
 SIGMA_T, ALBEDO, RADIANCE, SIZE, BLOCK = 1.0, 0.9, 10.0, 16, 4
 PER_SIDE, STEPS, DIRECTIONS, SPP = 12, 16, 48, 256
@@ -104,9 +105,10 @@ def errors(scenes, name: str, sigma_t: float = SIGMA_T, ball: dict | None = None
 
 
 @pytest.mark.usefixtures("mono")
+# Disks differ from rectangles by their outline, which `test_convergence_to_references` has.
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * ("cube" in name)) for name in LAMPS],
+    with_slow(list(LAMPS), "cube inside", "cube above", "disk inside", "large rectangle inside"),
 )
 def test_single_scattering(scenes, name):
     """Single scattering next to emitters agrees with quadrature, with 16 voxels along an edge.
@@ -141,7 +143,7 @@ def close_lamp_image(scene: mi.Scene, lamp_shape: mi.Shape, paths: int = 1 << 23
 
 
 @pytest.mark.usefixtures("mono")
-@pytest.mark.parametrize("solver", ["path", "sweep"])
+@pytest.mark.parametrize("solver", with_slow(["path", "sweep"], "path"))
 def test_small_emitter_close_to_a_face(scenes, solver):
     """A small emitter close to a face of the medium, without an integrator of Mitsuba.
 
@@ -162,7 +164,9 @@ def test_small_emitter_close_to_a_face(scenes, solver):
 
 
 @pytest.mark.usefixtures("mono")
-@pytest.mark.parametrize(("sigma_t", "bound"), [(1.0, 0.015), (4.0, 0.01)])
+@pytest.mark.parametrize(
+    ("sigma_t", "bound"), [pytest.param(1.0, 0.015, marks=pytest.mark.slow), (4.0, 0.01)]
+)
 def test_single_scattering_by_sweep(scenes, sigma_t, bound):
     """Solver ``sweep`` evaluates emitters beside the medium in the same way, also dense ones."""
     mean, blocks = errors(scenes, "rectangle above", sigma_t, solver="sweep", resolution=32)
@@ -201,6 +205,8 @@ def test_points_on_emitters_increase_with_the_samples(scenes, monkeypatch):
     assert counts[1] >= 4 * counts[0]
 
 
+# `tests/unit/cache/test_area_light.py` has coarse data of high contrast, against quadrature.
+@pytest.mark.slow
 @pytest.mark.usefixtures("mono")
 def test_coarse_dense_data_beside_an_emitter():
     """Where lines to an emitter leave dense data of few voxels through several faces, defaults are
@@ -264,7 +270,7 @@ f 4 1 5
 
 
 @pytest.mark.usefixtures("mono")
-@pytest.mark.parametrize("max_depth", [2, -1])
+@pytest.mark.parametrize("max_depth", with_slow([2, -1], -1))
 def test_sampled_emitters_have_the_mean_of_the_closed_form(tmp_path, max_depth):
     """A far lamp that is a mesh of any shape, sampled from each voxel, is as bright as the same
     lamp in closed form.
@@ -295,6 +301,8 @@ def test_sampled_emitters_have_the_mean_of_the_closed_form(tmp_path, max_depth):
     assert means[1] == pytest.approx(means[0], rel=0.004)
 
 
+# `test_sweep_with_surfaces` compares both solvers under a lamp in a room, layer by layer.
+@pytest.mark.slow
 @pytest.mark.usefixtures("mono")
 def test_all_orders_do_not_depend_on_the_solver(scenes):
     """Both solvers scatter the same irradiance further."""
@@ -321,7 +329,7 @@ def test_cache_outlives_its_scene(scenes):
 
 
 @pytest.mark.usefixtures("rgb")
-@pytest.mark.parametrize("scale", [1.0, 2.5])
+@pytest.mark.parametrize("scale", with_slow([1.0, 2.5], 2.5))
 def test_texels_of_different_colours(scenes, scale):
     """A textured square above fog has the light of its texels, which have closed forms.
 

@@ -74,14 +74,23 @@ ORDERS = {
 SLOW = {
     Case("rectangle far"),
     Case("sphere near"),
+    Case("disk near"),
     Case("disk near", "rayleigh"),
+    Case("constant", "rayleigh"),
     Case("rectangle near", "hg 0.58"),
     Case("sphere near", "hg -0.4"),
     Case("directional", max_depth=-1),
     Case("point outside", max_depth=-1),
     *WIDE,
 }
-SLOW_PATH = {Case("disk near"), Case("rectangle near", "hg 0.58")}
+#: `test_area_lights` has the solver `path` with rectangles.
+SLOW_PATH = {Case("disk near"), Case("rectangle near"), Case("rectangle near", "hg 0.58")}
+SLOW_POINTS = {
+    Case("spot wide", "hg 0.58"),
+    Case("spot wide", "rayleigh"),
+    Case("spot narrow"),
+    Case("spot narrow", "rayleigh"),
+}
 
 
 def parameters(cases: Iterable[Case], slow: Container[Case] = SLOW) -> list:
@@ -110,7 +119,7 @@ def coarse_and_fine(case: Case) -> tuple[float, float]:
     return tuple(error(case, exact(case), resolution=n, **settings) for n in (32, 64))
 
 
-@pytest.mark.parametrize("case", POINTS, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", parameters(POINTS, SLOW_POINTS))
 def test_sweep_of_delta_lights(case):
     """With delta lights, the error of ``sweep`` decreases with the square of the voxel size.
 

@@ -8,6 +8,7 @@ import pytest
 
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.render.quadrature import QUADRATURES
+from tests.support.slow import with_slow
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -232,7 +233,8 @@ def flame(scenes) -> tuple[dict, dict]:
     return shape, scenes.volume(light, where)
 
 
-@pytest.mark.parametrize("max_depth", [2, 3, -1])
+# All orders by each solver: equilibrium.
+@pytest.mark.parametrize("max_depth", with_slow([2, 3, -1], 2, -1))
 def test_solvers_agree(scenes, max_depth):
     """Both solvers agree for each order and colour; the rays lie outside of all symmetry planes."""
     shape, light = flame(scenes)

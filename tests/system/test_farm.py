@@ -132,12 +132,42 @@ def test_frames_equal_images_that_are_rendered_one_by_one(tmp_path, capsys):
     assert capsys.readouterr().out == f"3 of 3 frames are in {frames}\n"
 
 
-def test_a_volume_larger_than_memory_is_swept_by_workers_that_are_killed(tmp_path):
-    """The irradiance is that of one machine but for rounding, and always the same bits."""
+@pytest.fixture
+def volume(tmp_path) -> Path:
+    """Return a scene whose volume is larger than memory."""
     rng = np.random.default_rng(1)
     np.save(tmp_path / "density.npy", rng.random((72, 64, 80), dtype=np.float32))
-    scene, file = tmp_path / "scene.xml", tmp_path / "light.npy"
+    scene = tmp_path / "scene.xml"
     scene.write_text(VOLUME_IN_FILE)
+    return scene
+
+
+def test_a_volume_larger_than_memory_is_swept_by_workers_one_of_which_is_killed(volume, tmp_path):
+    """The irradiance is that of one machine but for rounding, and frames and images read it."""
+    scene, file = volume, tmp_path / "light.npy"
+    process = farm("cache", scene, "-o", file)
+    lines_until(process, 9)
+    kill_worker(process)
+    said = process.communicate()[0]
+    assert process.returncode == 0 and f"wrote {file}" in said, said
+    assert not Path(f"{file}.parts").exists()
+    alone = load_scene(scene, {"light": str(tmp_path / "alone.npy")}, None)
+    expected = np.array(mi.render(alone, spp=1, seed=0))
+    np.testing.assert_allclose(np.load(file), np.load(tmp_path / "alone.npy"), rtol=1e-5)
+    frames = tmp_path / "frames"
+    process = farm("frames", scene, "-o", frames, "-D", f"light={file}", "--spp", "1")
+    said = process.communicate()[0]
+    assert process.returncode == 0, said
+    found = read_image(frames / "frame-0000.exr")
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+
+
+# Caches of the solver `path` are continued above, and the bits of such volumes are compared in
+# `tests/unit/farm/test_volume.py`, by workers of this process.
+@pytest.mark.slow
+def test_a_volume_larger_than_memory_is_continued_to_the_same_bits(volume, tmp_path):
+    """Neither the command that is killed nor two workers leave a trace."""
+    scene, file = volume, tmp_path / "light.npy"
     process = farm("cache", scene, "-o", file)
     lines_until(process, 9)
     kill_worker(process)
@@ -155,13 +185,3 @@ def test_a_volume_larger_than_memory_is_swept_by_workers_that_are_killed(tmp_pat
     said = process.communicate()[0]
     assert process.returncode == 0, said
     assert file.read_bytes() == (tmp_path / "undisturbed.npy").read_bytes()
-    alone = load_scene(scene, {"light": str(tmp_path / "alone.npy")}, None)
-    expected = np.array(mi.render(alone, spp=1, seed=0))
-    np.testing.assert_allclose(np.load(file), np.load(tmp_path / "alone.npy"), rtol=1e-5)
-    # Frames read it, and so does an image.
-    frames = tmp_path / "frames"
-    process = farm("frames", scene, "-o", frames, "-D", f"light={file}", "--spp", "1")
-    said = process.communicate()[0]
-    assert process.returncode == 0, said
-    found = read_image(frames / "frame-0000.exr")
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)

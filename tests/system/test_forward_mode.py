@@ -17,6 +17,7 @@ from experiments.validation.gradients.differences import (
     pixel_weights,
 )
 from mitsuba_irrcache.errors import IrrcacheError
+from tests.support.slow import with_slow
 
 #: Largest relative difference between the derivatives of both modes: both discretise the same
 #: operators, whose transposes agree within a few thousandths.
@@ -59,7 +60,7 @@ def test_both_modes_agree_in_colour(rgb, name):
     check(CASES[name])
 
 
-@pytest.mark.parametrize("name", ["hg 0.3, sun", "hg 0.65, sun"])
+@pytest.mark.parametrize("name", with_slow(["hg 0.3, sun", "hg 0.65, sun"], "hg 0.3, sun"))
 def test_both_modes_agree_with_anisotropic_scattering(mono, name):
     check(CASES[name], 0.02)
 

@@ -94,12 +94,13 @@ def error(view: dict, spp: int, settings: dict | None = None, **objects: dict) -
 
 @pytest.mark.parametrize(
     ("kind", "angle", "depth", "g", "albedo", "tint"),
+    # Of suns that in coloured extinction, of emitters at a finite distance the lamp.
     [
-        ("sun", 8, 4.0, 0.85, 0.95, (1.0,)),
-        ("sun", 4, 3.0, 0.7, 0.95, (1.0,)),
-        ("sun", 8, 3.0, 0.85, ALBEDO, (1.0,)),
+        pytest.param("sun", 8, 4.0, 0.85, 0.95, (1.0,), marks=pytest.mark.slow),
+        pytest.param("sun", 4, 3.0, 0.7, 0.95, (1.0,), marks=pytest.mark.slow),
+        pytest.param("sun", 8, 3.0, 0.85, ALBEDO, (1.0,), marks=pytest.mark.slow),
         ("sun", 8, 3.0, 0.85, 0.95, (0.5, 1.0, 1.5)),
-        ("point", 8, 4.0, 0.85, 0.95, (1.0,)),
+        pytest.param("point", 8, 4.0, 0.85, 0.95, (1.0,), marks=pytest.mark.slow),
         ("lamp", 20, 4.0, 0.85, 0.95, (1.0,)),
         ("spot of an environment", 10, 4.0, 0.85, 0.95, (1.0,)),
     ],

@@ -29,14 +29,16 @@ def fewer_paths(monkeypatch):
     monkeypatch.setattr(surroundings, "EXCHANGED", 1 << 16)
 
 
+# Of what `make stress` runs, the floor and a sun are in the test in colour, a window in that of
+# panes, and a distant object in `test_a_distant_object_changes_nothing`.
 @pytest.mark.parametrize(
     ("name", "parameters"),
     [
-        ("ground, sky", ("sigma_t", "floor")),
+        pytest.param("ground, sky", ("sigma_t", "floor"), marks=pytest.mark.slow),
         pytest.param("lamp", ("albedo", "lamp"), marks=pytest.mark.slow),
         ("two media, sky", ("sigma_t", "other.interior_medium.sigma_t")),
-        ("distant object, empty voxels", ("sigma_t",)),
-        ("ground, sun through a window", ("sigma_t",)),
+        pytest.param("distant object, empty voxels", ("sigma_t",), marks=pytest.mark.slow),
+        pytest.param("ground, sun through a window", ("sigma_t",), marks=pytest.mark.slow),
     ],
 )
 def test_gradients_are_those_of_the_image(mono, name, parameters):
@@ -56,7 +58,7 @@ def test_hidden_lamps_do_not_hide_the_medium(mono):
     place = mi.ScalarTransform4f().look_at(0.9 * camera, 0 * camera, [0, 1, 0]).scale(0.3)
     lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": 1e-4}}
     found = []
-    for objects in (distant, lambda: distant() | {"front": lamp}):
+    for objects in (dict, lambda: {"front": lamp}):
         scene = Case(objects=objects).load(hide_emitters=True)
         found.append(gradients(scene, ("sigma_t",), pixel_weights(scene))["sigma_t"])
     smooth = np.array(Case().sigma_t(), dtype=np.float64)
@@ -64,7 +66,11 @@ def test_hidden_lamps_do_not_hide_the_medium(mono):
     assert hidden == pytest.approx(alone, rel=0.05)
 
 
-@pytest.mark.parametrize("opacity", [None, 0.4], ids=["thindielectric", "mask"])
+@pytest.mark.parametrize(
+    "opacity",
+    [None, pytest.param(0.4, marks=pytest.mark.slow)],
+    ids=["thindielectric", "mask"],
+)
 def test_emitters_stay_hidden_behind_panes(mono, opacity):
     """Images depend linearly on the sky's radiance, and do not show a hidden sky behind a pane, but
     gradients counted it: they were 8 to 20 times too large.

@@ -107,7 +107,7 @@ def test_a_lamp_reflected_by_glass_before_a_medium_with_a_forward_peak(scenes):
         "sun": None,
     }
     settings = {"solver": "auto", "resolution": 20}
-    check(*images(scenes, objects, settings, {"max_depth": -1, "rr_depth": 50}, (64, 1024)))
+    check(*images(scenes, objects, settings, {"max_depth": -1, "rr_depth": 50}, (64, 512)))
 
 
 @pytest.mark.parametrize("bsdf", [GLASS, ROUGH])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
+from tests.support.slow import with_slow
 from tests.support.surfaces import SIZE, ball, blocks, bound, check, fog, ground, lamp, ref
 from tests.support.torus import torus
 
@@ -76,7 +77,11 @@ def reference(objects: dict, kind: str, depth: int, seed: int, spp: int) -> np.n
     return np.array(image, dtype=np.float64)[..., :3]
 
 
-@pytest.mark.parametrize("name", CASES)
+#: Their shapes are also rendered in colour or with all orders, and single scattering in the ring.
+SLOW = "nested", "mesh in colour", "nested, single scattering", "hole, single scattering"
+
+
+@pytest.mark.parametrize("name", with_slow(list(CASES), *SLOW))
 def test_images_are_those_of_volpath(name, scenes):
     """Images under a sky and a sun agree in all blocks, with an error of 2 % allowed."""
     make, settings = CASES[name]

@@ -32,8 +32,15 @@ def floor_through_smoke() -> dict:
     return {"smoke": bound(interior=fog((2, 2, 2))), "floor": floor, "cube": beside}
 
 
-@pytest.mark.parametrize("solver", ["path", "sweep"])
-@pytest.mark.parametrize("objects", [floor_and_cube, floor_through_smoke])
+@pytest.mark.parametrize(
+    ("objects", "solver"),
+    [
+        (floor_and_cube, "sweep"),
+        pytest.param(floor_and_cube, "path", marks=pytest.mark.slow),
+        (floor_through_smoke, "path"),
+        (floor_through_smoke, "sweep"),
+    ],
+)
 def test_the_image_is_that_of_separate_meshes(scenes, monkeypatch, objects, solver):
     """Shadow rays ended at bounds that were too small, so that floors did not hide the sky, and
     floors among voxels were not found.

@@ -10,6 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.slow import with_slow
+
 pytestmark = pytest.mark.usefixtures("rgb")
 
 #: Values assigned to a parameter one after the other, in units of its initial value.
@@ -206,7 +208,9 @@ def own_keys(scenes, world: str, solver: str) -> list[str]:
     return [key for key, kind in kinds.items() if kind not in known]
 
 
-@pytest.mark.parametrize("world", WORLDS)
+# The many parameters of surfaces and of suns in skies are assigned together below, and one by one
+# in `tests/unit/scene/test_fingerprint_of_every_plugin.py`, without images.
+@pytest.mark.parametrize("world", with_slow(WORLDS, "surfaces", "sunsky"))
 def test_every_assigned_parameter_changes_the_image(scenes, world):
     """Every assigned parameter changes the image, and its previous value restores it.
 
@@ -262,7 +266,7 @@ def test_parameters_assigned_together_change_the_image_by_sweep(scenes, world):
     np.testing.assert_array_equal(found, edited_image(loaded(scenes, world, "sweep"), given))
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", with_slow(WORLDS, "surfaces"))
 def test_arrays_edited_in_place_change_the_image(scenes, world):
     """Edits in place by ``dr.scatter``, as documented by Mitsuba, change the image."""
     scene = loaded(scenes, world, "path")

@@ -56,7 +56,9 @@ def single(scene: mi.Scene) -> np.ndarray:
     return image.reshape(SIZE, PER_SIDE, SIZE, PER_SIDE).mean(axis=(1, 3))
 
 
-@pytest.mark.parametrize(("cutoff", "rmse"), [(7.0, 0.04), (30.0, 0.015)])
+@pytest.mark.parametrize(
+    ("cutoff", "rmse"), [(7.0, 0.04), pytest.param(30.0, 0.015, marks=pytest.mark.slow)]
+)
 def test_single_scattering(scenes, cutoff, rmse):
     """Single scattering of a spot light of 7 degrees agrees with quadrature.
 

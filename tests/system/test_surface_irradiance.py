@@ -158,11 +158,15 @@ SCENES = {
 }
 
 
-# The closed room takes most of a minute; `test_surfaces_among_voxels` has closed rooms with nodes.
+#: The closed room takes most of a minute; `test_surfaces_among_voxels` has closed rooms with nodes.
+#: The still life has the objects of the others, beside a medium instead of in it.
+SLOW = "room", "still life", "contact, two-sided"
+
+
 @pytest.mark.parametrize(
     ("build", "options"),
     [
-        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name == "room"))
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name in SLOW))
         for name, case in SCENES.items()
     ],
 )
@@ -364,6 +368,8 @@ def test_an_image_of_few_samples_is_path_traced(scenes, monkeypatch):
     np.testing.assert_array_equal(scenes.image(scene, spp=4), few)
 
 
+# `tests/unit/pipeline/test_scenes_are_freed.py` checks that nothing holds objects of a scene.
+@pytest.mark.slow
 def test_another_scene_may_follow_with_volpath(scenes):
     """Nothing keeps emitters of a scene that is gone: Dr.Jit would call them without shapes."""
     scenes.image(scene_of(scenes, room()), spp=1)

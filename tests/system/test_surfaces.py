@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
+from tests.support.slow import with_slow
 from tests.support.surfaces import (
     SIZE,
     ball,
@@ -141,7 +142,20 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize(("build", "settings", "bounds"), SCENES.values(), ids=SCENES)
+#: Scenes of `make stress`. `test_area_lights` has lamps in media, `test_volpath` cameras in media,
+#: `test_surfaces_among_voxels` mirrors, `test_sweep_with_surfaces` points and the ground,
+#: `test_media_behind_glass` glass boundaries; media in coloured extinction are nested below.
+SLOW = (
+    "ground and mirror",
+    "lamp inside",
+    "bulb inside",
+    "camera inside",
+    "glass boundary",
+    "three media",
+)
+
+
+@pytest.mark.parametrize(("build", "settings", "bounds"), with_slow(SCENES, *SLOW))
 def test_scenes(scenes, tmp_path, build, settings, bounds):
     depth = {"max_depth": -1, "rr_depth": 50}
     check(*images(scenes, build(scenes, tmp_path), settings, depth, (64, 256)), **bounds)
@@ -177,7 +191,8 @@ def volpaths() -> dict:
     return {}
 
 
-@pytest.mark.parametrize(("build", "solver", "samples"), ORDERS.values(), ids=ORDERS)
+# With surfaces, the solver is `path`, too.
+@pytest.mark.parametrize(("build", "solver", "samples"), with_slow(ORDERS, "path"))
 def test_every_order_of_scattering_is_counted_once(scenes, volpaths, build, solver, samples):
     """The image at ``max_depth`` k less that at k - 1 agrees with volpath for k = 1 to 4.
 
@@ -208,7 +223,8 @@ def test_every_order_of_scattering_is_counted_once(scenes, volpaths, build, solv
         assert (np.abs(quarters) <= limit).all(), (quarters, limit)
 
 
-@pytest.mark.parametrize("hide", [False, True])
+# Emitters are visible in all other scenes.
+@pytest.mark.parametrize("hide", with_slow([False, True], False))
 def test_hidden_emitters_and_alpha(scenes, hide):
     """With visible and hidden emitters in front of and in the fog, image and alpha agree."""
     sensor = scenes.description({}, None, SIZE)["sensor"]

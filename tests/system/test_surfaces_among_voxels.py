@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.slow import with_slow
 from tests.support.surfaces import ball, blocks, bound, diffuse, fog, images, lamp, placed, ref
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -98,6 +99,7 @@ def test_shadow_of_a_sheet(scenes, height):
 
 
 NAMES = "coloured ball", "rod", "two-sided sheet", "ground that cuts", "luminous ball", "mirror"
+SLOW = "rod", "luminous ball", "two-sided sheet", "coloured ball"
 #: Objects that transmit: the medium behind them attenuates what passes.
 TRANSMITTING = "mask", "thin dielectric"
 
@@ -142,11 +144,9 @@ def object_named(name: str) -> dict:
 
 @pytest.mark.parametrize(
     ("name", "depth"),
+    # Sheet and luminous ball have single scattering, the coloured ball is in an image below.
     [
-        *(
-            pytest.param(name, -1, marks=[pytest.mark.slow] * (name in ("rod", "luminous ball")))
-            for name in NAMES
-        ),
+        *(pytest.param(name, -1, marks=[pytest.mark.slow] * (name in SLOW)) for name in NAMES),
         ("two-sided sheet", 2),
         ("luminous ball", 2),
         *((name, -1) for name in TRANSMITTING),
@@ -227,7 +227,8 @@ def test_edited_objects_are_solved_for_anew(scenes):
     np.testing.assert_allclose(found, scenes.image(fresh, spp=4), rtol=2e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("towards", [1, -1])
+# Both sides of the lamp are compared whatever its direction.
+@pytest.mark.parametrize("towards", with_slow([1, -1], -1))
 def test_lamps_may_lie_anywhere_in_a_voxel(scenes, towards):
     """The irradiance a few voxels from a black lamp does not depend on how it divides a voxel.
 

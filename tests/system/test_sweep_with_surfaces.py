@@ -10,6 +10,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sweep
+from tests.support.slow import with_slow
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -141,11 +142,15 @@ def blocks(image: np.ndarray) -> np.ndarray:
     return image.reshape(n, BLOCK, n, BLOCK, -1).mean(axis=(1, 3))
 
 
-# The closed room takes a minute. `test_small_and_large_emitters_agree_with_path` has it, too.
+#: The closed room takes a minute. `test_small_and_large_emitters_agree_with_path` has it, too. All
+#: orders in the scene of the occluder include the first one, and a sky.
+SLOW = "room", "the same, single scattering", "white sky"
+
+
 @pytest.mark.parametrize(
     ("build", "max_depth", "spp"),
     [
-        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name == "room"))
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name in SLOW))
         for name, case in SCENES.items()
     ],
 )
@@ -167,9 +172,13 @@ def test_volpath(scenes, build, max_depth, spp):
     assert abs(np.mean(ours) / scale - 1) < 0.005 + noise
 
 
-@pytest.mark.parametrize(
-    ("around", "tolerance"), [(lambda bsdf: {"ground": ground(bsdf)}, 0.01), (open_room, 0.02)]
-)
+FURNACES = {
+    "ground": (lambda bsdf: {"ground": ground(bsdf)}, 0.01),
+    "open room": (open_room, 0.02),
+}
+
+
+@pytest.mark.parametrize(("around", "tolerance"), with_slow(FURNACES, "open room"))
 def test_white_furnace(scenes, around, tolerance):
     """Without absorption under a sky of 1, image and cache are 1.
 
@@ -187,7 +196,8 @@ def test_white_furnace(scenes, around, tolerance):
     assert np.sqrt(((phi - 1) ** 2).mean()) < 0.03
 
 
-@pytest.mark.parametrize("size", [0.4, 2.4])
+# `test_surfaces_among_voxels` has luminous walls and balls that tracks hit.
+@pytest.mark.parametrize("size", with_slow([0.4, 2.4], 2.4))
 def test_small_and_large_emitters_agree_with_path(scenes, size):
     """Both layers of the cache agree with ``path`` for small and large area lights.
 

@@ -117,19 +117,6 @@ def test_edit_save_reload_and_second_window(browser, started):
     other.page.get_by_text("is no name for a file").first.wait_for()
     assert not list(folder.parent.glob("escaped*")) and not list(folder.glob("escaped*"))
 
-    # A slice appears at its place, and is dragged by an arrow.
-    other.unfold("Crop and slices")
-    sliced = after(other, lambda: other.choose("in the image", "this one"))
-    assert difference(sliced, elsewhere) > 1.5
-    place, mouse = other.canvas(), other.page.mouse
-    mouse.move(place["x"] + place["width"] / 2, place["y"] + 0.46 * place["height"])
-    mouse.down()
-    mouse.move(place["x"] + place["width"] / 2, place["y"] + 0.3 * place["height"], steps=5)
-    mouse.up()
-    finally_(other, lambda _: int(other.field("position, %").input_value()) > 60)
-    whole = after(other, lambda: other.choose("in the image", "none"))
-    assert difference(whole, elsewhere) < 0.5
-
     # The background has a name of CSS; other words are refused beside it.
     other.unfold("Camera, tone, background")
     field = other.page.locator("irrcache-background input[type=text]")
@@ -155,6 +142,28 @@ def test_edit_save_reload_and_second_window(browser, started):
     other.page.reload()
     assert difference(settled(other), elsewhere) < 0.5
     assert window.errors == [] and other.errors == []
+
+
+# It is a third of the time of both; `tests/unit/view/test_slices.py` has slices without a browser.
+@pytest.mark.slow
+def test_slices_are_dragged(browser, started):
+    """A slice appears at its place, and is dragged by an arrow."""
+    other = browser.open(started[0], SIZE)
+    other.unfold("Scattering and error")
+    other.enter("target error %", 25)
+    elsewhere = settled(other)
+    other.unfold("Crop and slices")
+    sliced = after(other, lambda: other.choose("in the image", "this one"))
+    assert difference(sliced, elsewhere) > 1.5
+    place, mouse = other.canvas(), other.page.mouse
+    mouse.move(place["x"] + place["width"] / 2, place["y"] + 0.46 * place["height"])
+    mouse.down()
+    mouse.move(place["x"] + place["width"] / 2, place["y"] + 0.3 * place["height"], steps=5)
+    mouse.up()
+    finally_(other, lambda _: int(other.field("position, %").input_value()) > 60)
+    whole = after(other, lambda: other.choose("in the image", "none"))
+    assert difference(whole, elsewhere) < 0.5
+    assert other.errors == []
 
 
 def test_pages_of_other_sites_are_refused(started):

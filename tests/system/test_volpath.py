@@ -12,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.support.slow import with_slow
+
 pytestmark = pytest.mark.usefixtures("rgb")
 
 SPP = 256
@@ -70,7 +72,7 @@ def cloud(scenes, to_world, shape=DENSITY, **properties) -> dict:
     return scenes.medium(sigma_t, scenes.texture(shape, 0.5, 1.0, 5), to_world, **properties)
 
 
-@pytest.mark.parametrize("max_depth", [0, 1, 2, 3, -1])
+@pytest.mark.parametrize("max_depth", with_slow([0, 1, 2, 3, -1], 2))
 def test_heterogeneous_cube(scenes, compare, max_depth):
     to_world = scenes.placement()
     shape = scenes.boundary(cloud(scenes, to_world), to_world)
@@ -97,7 +99,7 @@ PLACEMENTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS.values(), ids=PLACEMENTS)
+@pytest.mark.parametrize("placement", with_slow(PLACEMENTS, "turned", "mirrored"))
 def test_placement_of_the_grid(scenes, compare, placement):
     to_world = scenes.placement(**placement)
     compare(scenes.boundary(cloud(scenes, to_world), to_world)).check()
@@ -116,13 +118,14 @@ def test_rgb_grids(scenes, compare):
     compare(scenes.boundary(scenes.medium(sigma_t, albedo, to_world, scale=1.3), to_world)).check()
 
 
-@pytest.mark.parametrize("max_depth", [2, -1])
+@pytest.mark.parametrize("max_depth", with_slow([2, -1], 2))
 def test_homogeneous_rgb(scenes, compare, max_depth):
     medium = scenes.medium((1.0, 1.2, 1.4), (0.9, 0.6, 0.95))
     compare(scenes.boundary(medium), max_depth).check()
 
 
-@pytest.mark.parametrize("max_depth", [2, -1])
+# All orders in coloured extinction: `test_sweep.py`, as three grey ones.
+@pytest.mark.parametrize("max_depth", with_slow([2, -1], -1))
 def test_chromatic_extinction(scenes, compare, max_depth):
     """Extinction of 1 : 4 : 12 at default settings agrees with ``volpathmis`` (measured: 0.4 to
     0.6 %).
@@ -147,8 +150,10 @@ def test_sphere(scenes, compare, kind):
     compare(scenes.boundary(medium, to_world, "sphere")).check()
 
 
-@pytest.mark.parametrize("turn", [0.0, 30.0])
-@pytest.mark.parametrize("grid", [1.4, 2.8])
+@pytest.mark.parametrize(
+    ("grid", "turn"),
+    with_slow([(1.4, 30.0), (2.8, 30.0), (1.4, 0.0), (2.8, 0.0)], (1.4, 0.0), (2.8, 0.0)),
+)
 def test_grid_smaller_or_larger_than_its_boundary(scenes, compare, grid, turn):
     """The medium ends at the world bounding box of its grid; its values are clamped between the
     two.
@@ -187,13 +192,9 @@ def _bright_window() -> np.ndarray:
     return sky
 
 
-@pytest.mark.parametrize(
-    "emitter",
-    [
-        pytest.param(emitter, id=name, marks=[pytest.mark.slow] * (name == "spot"))
-        for name, emitter in EMITTERS.items()
-    ],
-)
+# Emitters of all kinds are compared with exact references in `test_convergence_to_references`,
+# environment maps with volpath in `test_anisotropic_scattering`.
+@pytest.mark.parametrize("emitter", with_slow(EMITTERS, *EMITTERS))
 def test_emitters(scenes, compare, emitter):
     """Each kind of emitter agrees; sharp shadows require more voxels and shorter steps than a
     sky.

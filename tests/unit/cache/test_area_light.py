@@ -14,6 +14,7 @@ from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels
 from mitsuba_irrcache.scene.compile import compile_scene
+from tests.support.slow import with_slow
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -99,7 +100,7 @@ def test_coarse_data_of_high_contrast(scenes):
     assert ratio == pytest.approx(1, abs=0.015)
 
 
-@pytest.mark.parametrize("turn", [0.0, 30.0])
+@pytest.mark.parametrize("turn", with_slow([0.0, 30.0], 0.0))
 @pytest.mark.parametrize("half_width", [0.1, 0.23, 0.4])
 def test_transmittance_next_to_a_luminous_box(scenes, half_width, turn):
     """Within a voxel of a box in a medium, where lookups use voxels whose centre is in the box, the

@@ -20,6 +20,7 @@ from mitsuba_irrcache.view.light import Light
 from mitsuba_irrcache.view.reference import ViewReference, between
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
+from tests.support.slow import with_slow
 from tests.support.viewer_session import SCENE, SIZE, Screen, drag, front
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -63,7 +64,7 @@ def squares(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("document", "position"),
     [
-        ("cloud", (0.5, -5.0, 1.5)),
+        pytest.param("cloud", (0.5, -5.0, 1.5), marks=pytest.mark.slow),
         ("cloud", (0.1, -0.4, 0.2)),
         ("cloud over the ground", (0.5, -5.0, 1.5)),
     ],
@@ -195,7 +196,9 @@ def test_coarse_references_are_means_over_pixels(document):
     assert spread == pytest.approx(np.hypot(coarse.noise, fine.noise / 3), rel=0.2)
 
 
-@pytest.mark.parametrize("document", list(SCENES), indirect=True)
+@pytest.mark.parametrize(
+    "document", with_slow(list(SCENES), "cloud over the ground"), indirect=True
+)
 def test_previous_caches_are_freed(document, uncollected):
     """Previous caches are freed with their medium after an edit, also in windows with a
     reference.
