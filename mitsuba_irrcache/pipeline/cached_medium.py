@@ -174,6 +174,15 @@ class CachedMedium:
         return max(-(-samples // batch), 2 if self.settings.with_error else 1) * batch
 
     @property
+    def refinement(self) -> int:
+        """Samples of the cache over their default number, rounded down to a power of two, at least
+        1.
+        """
+        if self.is_dark:
+            return 1
+        return 1 << max(self.cache.samples // self.target(0), 1).bit_length() - 1
+
+    @property
     def is_dark(self) -> bool:
         """Whether there is no cache or it is zero, so that samples have no effect."""
         return self.cache is None or not self.cache.active_count

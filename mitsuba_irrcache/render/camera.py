@@ -100,7 +100,8 @@ def camera_rays_of(
         closed_form = parts[0].half_space
         return ClosedFormCameraRays(projections[0], settings.max_depth, hide_emitters, closed_form)
     depths = settings.max_depth, settings.rr_depth
-    return TracedCameraRays(parts[0].description, projections, *depths, hide_emitters)
+    refinement = max(part.refinement for part in parts)
+    return TracedCameraRays(parts[0].description, projections, *depths, hide_emitters, refinement)
 
 
 def _along_rays(cache: IrradianceCache) -> list[DirectLightAlongRays]:
@@ -258,8 +259,11 @@ class TracedCameraRays:
         max_depth: int,
         rr_depth: int,
         hide_emitters: bool,
+        refinement: int = 1,
     ) -> None:
+        """``refinement`` multiplies the numbers of rays that gather irradiance on surfaces."""
         self.media, self.projections = description.media, projections
+        self._refinement = refinement
         self.background_bound = description.background_bound
         #: the projection with most channels: media without a cache have no error estimates
         self.projection = max(projections, key=lambda p: p.channel_count)
@@ -293,7 +297,8 @@ class TracedCameraRays:
     def adopt(self, earlier: TracedCameraRays) -> None:
         """Reuse the surface nodes of camera rays for an ``earlier`` state of the same caches."""
         if earlier._surfaces is not None:
-            self._surfaces = earlier._surfaces.renewed(self._paths(earlier._surfaces.nodes))
+            paths = self._paths(earlier._surfaces.nodes)
+            self._surfaces = earlier._surfaces.renewed(paths, self._refinement)
 
     def _paths(self, nodes: SurfaceNodes | None = None) -> SurfacePaths:
         rest = self.background_bound, self.rr_depth, nodes, self._refracts
@@ -312,7 +317,7 @@ class TracedCameraRays:
             return
         view = view_extent(sensor)
         if self._surfaces is None or not self._surfaces.has_space_for(view):
-            self._surfaces = SurfaceIrradiance(self._paths(), seed)
+            self._surfaces = SurfaceIrradiance(self._paths(), seed, self._refinement)
         ray = scattered_rays(sensor, PLACEMENT_RAYS)
         medium = sensor.get_medium()
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)

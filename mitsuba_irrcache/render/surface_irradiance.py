@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.cache.angular import Source
 from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
@@ -45,18 +46,35 @@ LANES = 1 << 21
 MIN_SLOPE = 0.3
 #: Relative change of the irradiances at which the iteration ends, and the most iterations.
 CONVERGED, MOST_ITERATIONS = 1e-4, 500
+#: Number of parts of the rays of each node whose solutions are compared, and the relative change at
+#: which their iteration ends. Each part is about as well distributed as all rays.
+PARTS, PARTS_CONVERGED = 8, 1e-2
+#: Estimated standard error of the mean irradiance on the surfaces in view, relative to it, above
+#: which a warning is logged; and the same if emitters are sampled, whose direct irradiance, most of
+#: it, is not part of this.
+LARGE_NOISE, LARGE_INDIRECT_NOISE = 0.01, 0.03
+#: Standard error that more rays aim at if it exceeds LARGE_NOISE, by at most MOST_MORE times their
+#: number, and MOST_RAYS in all.
+AIMED_NOISE, MOST_MORE, MOST_RAYS = 0.007, 16, 1 << 23
 
 
 class SurfaceIrradiance:
     """The cached irradiance on the surfaces of a scene."""
 
     def __init__(
-        self, paths: SurfacePaths, seed: int, groups: Sequence[tuple[int, int, int]] = ()
+        self,
+        paths: SurfacePaths,
+        seed: int,
+        refinement: int = 1,
+        groups: Sequence[tuple[int, int, int]] = (),
     ) -> None:
-        """``groups`` are those of the nodes that ``paths`` have already: the first of consecutive
-        nodes, the end, and the number of rays that gather radiance.
+        """Gather radiance along ``refinement`` times the usual numbers of rays.
+
+        ``groups`` are those of the nodes that ``paths`` have already: the first of consecutive
+        nodes, the end, and the usual number of rays.
         """
         self.paths, self.nodes, self.seed = paths, paths.nodes, seed
+        self._refinement = refinement
         self._seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self._channels = range(dr.size_v(mi.Spectrum))
         self._groups = list(groups)
@@ -64,9 +82,9 @@ class SurfaceIrradiance:
         self._gathered = 0  # groups
         self._view: ViewExtent | None = None  # the last one
 
-    def renewed(self, paths: SurfacePaths) -> SurfaceIrradiance:
+    def renewed(self, paths: SurfacePaths, refinement: int = 1) -> SurfaceIrradiance:
         """Return the same nodes, with irradiance gathered again along ``paths``."""
-        return SurfaceIrradiance(paths, self.seed, self._groups)
+        return SurfaceIrradiance(paths, self.seed, refinement, self._groups)
 
     def has_space_for(self, view: ViewExtent) -> bool:
         """Return whether nodes for ``view`` can be added, or were computed last."""
@@ -81,11 +99,25 @@ class SurfaceIrradiance:
         rng = random_stream(mi.sample_tea_32(dr.arange(mi.UInt32, dr.width(ray)), self._seed))
         place, found, _ = self.paths.walk(scene, ray, pointer, rng, mi.Bool(True))
         self._cover(scene, place, found)
+        if self._gathered == len(self._groups):
+            return
+        first, end, _ = self._groups[self._gathered]
+        self._complete(scene)
+        error = self._standard_error(first, end)
+        factor = self._more_rays(error)
+        if factor > 1:
+            self._refinement *= factor
+            self._exchange, self._gathered = [], 0
+            self._complete(scene)
+            error = self._standard_error(first, end)
+        self._warn_of_noise(error)
+
+    def _complete(self, scene: mi.Scene) -> None:
+        """Gather radiance at all nodes that have none, and compute the irradiance of all."""
         for first, end, rays in self._groups[self._gathered :]:
-            self._gather(scene, first, end, rays)
-        if self._gathered < len(self._groups):
-            self._gathered = len(self._groups)
-            self._solve()
+            self._gather(scene, first, end, self._refinement * rays)
+        self._gathered = len(self._groups)
+        self._solve()
 
     # Placement
 
@@ -187,9 +219,12 @@ class SurfaceIrradiance:
     ) -> tuple[mi.Ray3f, mi.PCG32]:
         """Sample cosine-distributed rays from nodes.
 
-        ``ray`` is (lane of the node, number of the ray out of ``count``).
+        ``ray`` is (lane of the node, number of the ray out of ``count``). Rays of consecutive
+        numbers, ``count`` / PARTS at a time, are distributed like all rays.
         """
         lane, k = ray
+        part, k = Divisor(count // PARTS).split(k)
+        k = k * PARTS + part
         words = mi.sample_tea_32(
             dr.gather(mi.UInt32, self.nodes.streams(numbers)[0], lane), self._seed
         )
@@ -224,12 +259,14 @@ class SurfaceIrradiance:
             weight = dr.opaque(mi.Float, dr.pi / rays)
             radiance, factor = (emitted + radiance) * weight, factor * weight
             dr.eval(radiance, other, factor)  # in one launch
-            own = [dr.block_sum(c, rays) for c in list(radiance)]
+            parts = [dr.block_sum(c, rays // PARTS) for c in list(radiance)]
+            own = [dr.block_sum(c, PARTS) for c in parts]
             for source in self.paths.narrow_sources:
                 around = self._gather_around(scene, source, numbers, (p, normals, medium, distance))
                 own = [a + b for a, b in zip(own, around, strict=True)]
-            dr.eval(own)
-            self._exchange.append(Exchange(rays, own, other, list(factor)))
+            mean = PARTS / len(parts) * sum(parts)
+            dr.eval(own, mean)
+            self._exchange.append(Exchange(rays, own, other, list(factor), mean))
 
     def _gather_around(
         self, scene: mi.Scene, source: Source, numbers: mi.UInt32, place: tuple
@@ -277,24 +314,72 @@ class SurfaceIrradiance:
         for _ in range(MOST_ITERATIONS):
             parts = [part.gathered(total) for part in self._exchange]
             following = [concatenated([part[c] for part in parts]) for c in self._channels]
-            change = sum(dr.sum(dr.abs(a - b)) for a, b in zip(following, total, strict=True))
-            scale = sum(dr.sum(a) for a in following)
-            dr.eval(following, change, scale)
+            change, scale = _change(following, total)
             total = following
-            if not change[0] > CONVERGED * scale[0]:
+            if not change > CONVERGED * scale:
                 break
         self.paths.irradiance = total
+
+    def _more_rays(self, error: float) -> int:
+        """Return by what factor, a power of two, there should be more rays for a standard
+        ``error``.
+        """
+        if not error > LARGE_NOISE:
+            return 1
+        rays = self._refinement * sum((end - first) * n for first, end, n in self._groups)
+        wanted = np.ceil(np.log2((error / AIMED_NOISE) ** 2))
+        affordable = np.floor(np.log2(max(MOST_RAYS / rays, 1)))
+        return 1 << int(min(wanted, affordable, np.log2(MOST_MORE)))
+
+    def _warn_of_noise(self, error: float) -> None:
+        """Log a warning if the mean irradiance in view has a large standard ``error``."""
+        is_indirect = self.paths.emitters.count[0] > 0
+        if error > (LARGE_INDIRECT_NOISE if is_indirect else LARGE_NOISE):
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"irrcache: the irradiance on surfaces has noise of about {error:.1%} of its mean, "
+                "and several times as much in small regions: few of the rays that sample it find "
+                "the light, for example through a small window. Raise cache_spp, which multiplies "
+                "their number, or render with volpath.",
+            )
+
+    def _standard_error(self, first: int, end: int) -> float:
+        """Estimate the standard error of the mean irradiance of the nodes from ``first`` to
+        ``end``, relative to it, from solutions with parts of the rays.
+        """
+        channels = len(self._channels)
+        mean = sum(self.paths.irradiance) * (1 / channels)
+        total = dr.repeat(mean, PARTS)
+        for _ in range(MOST_ITERATIONS):
+            following = concatenated([part.parts_gathered(total) for part in self._exchange])
+            change, scale = _change([following], [total])
+            total = following
+            if not change > PARTS_CONVERGED * scale:
+                break
+        lane = dr.arange(mi.UInt32, (end - first) * PARTS) + dr.opaque(mi.UInt32, first * PARTS)
+        _, part = Divisor(PARTS).split(lane)
+        sums = dr.zeros(mi.Float, PARTS)
+        dr.scatter_add(sums, dr.gather(mi.Float, total, lane), part)
+        found = np.array(sums, dtype=np.float64)
+        return float(found.std(ddof=1) / np.sqrt(PARTS) / max(found.mean(), 1e-300))
 
 
 class Exchange:
     """Rows of E = E_0 + H E for consecutive nodes: ``own`` is E_0, and ``factors`` are those of the
-    irradiance of the ``other`` nodes that their rays hit, ``rays`` per node.
+    irradiance of the ``other`` nodes that their rays hit, ``rays`` per node. ``parts`` are E_0 by
+    PARTS of the rays, the mean of the channels.
     """
 
     def __init__(
-        self, rays: int, own: list[mi.Float], other: mi.UInt32, factors: list[mi.Float]
+        self,
+        rays: int,
+        own: list[mi.Float],
+        other: mi.UInt32,
+        factors: list[mi.Float],
+        parts: mi.Float,
     ) -> None:
         self.rays, self.own, self.other, self.factors = rays, own, other, factors
+        self.parts = parts
 
     def gathered(self, total: list[mi.Float]) -> list[mi.Float]:
         """Return the irradiance per channel, given the irradiance ``total`` of all nodes."""
@@ -304,6 +389,26 @@ class Exchange:
         ]
         dr.eval(received)
         return [a + dr.block_sum(b, self.rays) for a, b in zip(self.own, received, strict=True)]
+
+    def parts_gathered(self, total: mi.Float) -> mi.Float:
+        """Return the irradiance by each of PARTS of the rays, given that of all nodes by the same
+        parts: the mean of the channels.
+        """
+        rays = self.rays // PARTS
+        part, _ = Divisor(rays).split(dr.arange(mi.UInt32, dr.width(self.other)))
+        _, part = Divisor(PARTS).split(part)
+        factor = sum(self.factors) * (PARTS / len(self.factors))
+        received = factor * dr.gather(mi.Float, total, self.other * PARTS + part)
+        dr.eval(received)
+        return self.parts + dr.block_sum(received, rays)
+
+
+def _change(following: list[mi.Float], total: list[mi.Float]) -> tuple[float, float]:
+    """Return the sum of the absolute differences of arrays, and the sum of the first ones."""
+    change = sum(dr.sum(dr.abs(a - b)) for a, b in zip(following, total, strict=True))
+    scale = sum(dr.sum(a) for a in following)
+    dr.eval(following, change, scale)
+    return float(change[0]), float(scale[0])
 
 
 def _henyey_greenstein(g: mi.Float, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:

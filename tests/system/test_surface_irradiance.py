@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.render import camera, film
+from mitsuba_irrcache.render import camera, film, surface_irradiance
 from tests.support.surfaces import ball, bound, colour, diffuse, fog, ground, lamp, placed
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -429,3 +429,65 @@ def test_passes_of_an_image_have_independent_new_samples(scenes, monkeypatch):
     monkeypatch.setattr(film, "LANES", 8 * SIZE**2)
     scenes.image(scene, spp=32)
     assert len(streams) == len(set(streams)) == 4
+
+
+def below_a_window() -> dict:
+    """Return a floor with smoke in a large black room, lit by the sky through a window above."""
+    black = diffuse(0, 0, 0)
+    sides = [(6, 0, 0), (-6, 0, 0), (0, 0, 6), (0, 0, -6), (0, -6, 0)]
+    walls = {f"wall{n}": wall(p, (0, 0, 0.01), black) for n, p in enumerate(sides)}
+    for own in walls.values():
+        own["to_world"] = own["to_world"].scale((3.5, 3.5, 1))
+    frame = [(-3.3, 0, 3, 7), (3.3, 0, 3, 7), (0, -3.3, 0.3, 3), (0, 3.3, 0.3, 3)]
+    for n, (x, z, width, depth) in enumerate(frame):
+        place = mi.ScalarTransform4f().translate((x, 6, z)).rotate((1, 0, 0), 90)
+        place = place.scale((width, depth, 1))
+        walls[f"frame{n}"] = {"type": "rectangle", "to_world": place, "bsdf": black}
+    sky = {"type": "constant", "radiance": 1.0}
+    smoke = bound(interior=fog((0.1, 0.1, 0.1)), scale=(0.9, 0.9, 0.9))
+    return walls | {"smoke": smoke, "floor": ground(), "emitter": sky}
+
+
+def test_noise_of_the_nodes_is_estimated_and_falls_with_cache_spp(scenes, monkeypatch):
+    """Rooms with small windows had noise of several percent, which no property reduced."""
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
+    monkeypatch.setattr(surface_irradiance, "MOST_MORE", 1)
+    noise = []
+    for factor, seeds in ((1, 6), (16, 3)):
+        means, estimates = [], []
+        for seed in range(seeds):
+            scene = scene_of(scenes, below_a_window(), cache_spp=0, cache_seed=seed)
+            integrator = scene.integrator()
+            integrator.prepare(scene)
+            integrator.cache_spp = factor * integrator._builder.parts[0].target(0)
+            scenes.image(scene, spp=1)
+            surfaces = integrator._source.latest._surfaces
+            (_, end, rays), *_ = surfaces._groups
+            assert surfaces._exchange[0].rays == factor * rays
+            means.append(np.array(surfaces.paths.irradiance[0])[:end].mean())
+            estimates.append(surfaces._standard_error(0, end))
+            del scene, integrator, surfaces
+        noise.append((np.std(means, ddof=1) / np.mean(means), np.median(estimates)))
+    (before, estimated), (_, after) = noise
+    assert 0.4 < estimated / before < 2.5
+    assert estimated > 0.01
+    assert 2.5 < estimated / after < 7
+    assert sum("irradiance on surfaces has noise" in text for text in messages) >= 4
+
+
+def test_noisy_nodes_get_more_rays_within_a_budget(scenes, monkeypatch):
+    used = []
+    for budget in (1 << 23, 1 << 20):
+        monkeypatch.setattr(surface_irradiance, "MOST_RAYS", budget)
+        scene = scene_of(scenes, below_a_window(), cache_spp=0)
+        scenes.image(scene, spp=1)
+        surfaces = scene.integrator()._source.latest._surfaces
+        rays = [part.rays * dr.width(part.own[0]) for part in surfaces._exchange]
+        usual = sum((end - first) * n for first, end, n in surfaces._groups)
+        used.append((sum(rays) // usual, surfaces._standard_error(*surfaces._groups[0][:2])))
+        assert sum(rays) <= max(budget, usual)
+        del scene, surfaces
+    (more, small), (fewer, large) = used
+    assert more > 1 and fewer == 1
+    assert small < large
