@@ -35,6 +35,7 @@ from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
 from mitsuba_irrcache.machine.doctor import available_cores
 from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.stream_parts import StreamParts
 
 #: Held by the thread that works: a worker with several threads runs one job at a time, since Dr.Jit
@@ -150,8 +151,7 @@ def _prepare(scene: mi.Scene) -> None:
     The samples are the same as those that would be computed, so images do not depend on which
     worker renders which frame.
     """
-    integrator = scene.integrator()
-    media = [m for m in integrator.cached_media(scene) if not m.is_dark and not m.settings.file]
+    media = _with_caches_of_their_own(scene)
     for medium in media:
         medium.cache.fingerprint = medium.fingerprint(scene)
     settings = [
@@ -165,8 +165,15 @@ def _prepare(scene: mi.Scene) -> None:
     if key == _CACHES.key:
         for medium, known in zip(media, _CACHES.value, strict=True):
             medium.cache.append(known, 0)
-    integrator.prepare(scene)
-    _CACHES.key, _CACHES.value = key, [_bare(medium.cache) for medium in media]
+    scene.integrator().prepare(scene)
+    if media == _with_caches_of_their_own(scene):  # otherwise they were replaced by new ones
+        _CACHES.key, _CACHES.value = key, [_bare(medium.cache) for medium in media]
+
+
+def _with_caches_of_their_own(scene: mi.Scene) -> list[CachedMedium]:
+    """Return the media of a scene whose caches are neither zero nor in files."""
+    media = scene.integrator().cached_media(scene)
+    return [medium for medium in media if not medium.is_dark and not medium.settings.file]
 
 
 def _bare(cache: IrradianceCache) -> IrradianceCache:

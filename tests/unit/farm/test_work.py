@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import importlib
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from mitsuba_irrcache.farm.studies import SceneStudy, arguments_by_scene
 from mitsuba_irrcache.farm.work import KINDS, UnfitWorkerError, set_up
 from mitsuba_irrcache.io.images import read_image, write_image
 from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -207,6 +209,36 @@ def test_frames_that_need_no_cache_are_rendered_without_one(environment, tmp_pat
     assert scene.integrator().cache.samples == 0
     # Mitsuba's film adds in no fixed order.
     np.testing.assert_allclose(read_image(tmp_path / "found.exr"), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("is_edited", [False, True])
+def test_frames_under_an_environment_map(scene, environment, tmp_path, monkeypatch, is_edited):
+    """Also where the integrator replaces its caches after their fingerprints were computed."""
+    sky = scene.with_name("sky.exr")
+    mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(sky))
+    named = f'<emitter type="envmap"><string name="filename" value="{sky}"/>'
+    text = scene.read_text().replace('<emitter type="constant">', named)
+    assert named in text
+    scene.write_text(re.sub('<rgb name="radiance".*?/>', "", text))
+    integrator = "irrcache{solver=path,resolution=4,cache_spp=16}"
+    job = frame_job(scene, integrator, environment, SMALL)
+    expected = np.array(mi.render(load_scene(scene, SMALL, integrator), spp=1, seed=0))
+    if is_edited:
+        fingerprint = CachedMedium.fingerprint
+
+        def and_edit(medium, scene):
+            params = mi.traverse(scene)
+            (key,) = (key for key in params.keys() if key.endswith(".irradiance.value"))
+            params[key] = params[key] * 2
+            params.update()
+            return fingerprint(medium, scene)
+
+        monkeypatch.setattr(CachedMedium, "fingerprint", and_edit)
+    for name in ("first", "second"):
+        found = outcome(job, tmp_path / name)
+        (tmp_path / "found.exr").write_bytes(found.files["frame.exr"])
+        if not is_edited:
+            np.testing.assert_array_equal(read_image(tmp_path / "found.exr"), expected)
 
 
 def test_a_worker_that_sees_other_files_says_so(scene, tmp_path):
