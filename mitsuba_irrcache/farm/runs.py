@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import shutil
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import mitsuba as mi
@@ -19,15 +19,15 @@ from mitsuba_irrcache.compare.reference import (
     require_emission,
 )
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.farm.cache import CacheRun
+from mitsuba_irrcache.farm.cache import CacheRun, waiting_parts
 from mitsuba_irrcache.farm.cluster import MOST_WORKERS, ClusterOptions, connected
 from mitsuba_irrcache.farm.dispatch import Dispatch
 from mitsuba_irrcache.farm.frames import begin_frames, frame_jobs
 from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
-from mitsuba_irrcache.farm.references import ReferenceRun
+from mitsuba_irrcache.farm.references import ReferenceRun, waiting_launches
 from mitsuba_irrcache.farm.results import Outcome, Results
 from mitsuba_irrcache.farm.studies import SceneStudy, arguments_by_scene
-from mitsuba_irrcache.farm.volume import FarmSweep
+from mitsuba_irrcache.farm.volume import NAMES, FarmSweep
 from mitsuba_irrcache.io.scene_files import (
     check_scene_file,
     load_scene,
@@ -53,12 +53,13 @@ def run_cache(args: argparse.Namespace) -> int:
     if getattr(loaded.integrator(), "mapped_medium", None) is not None:
         return _fill_volume(args, options, environment, loaded)
     arguments = scene_arguments(scene, parameters, integrator)
-    cache = CacheRun(arguments, loaded, environment, args.output, args.resume)
-    jobs = cache.begin()
-    try:
-        status = _dispatch(options, jobs, cache.store)
-    finally:
-        complete = cache.finish()
+    with waiting_parts(args.output).alone(resume=True):
+        cache = CacheRun(arguments, loaded, environment, args.output, args.resume)
+        jobs = cache.begin()
+        try:
+            status = _dispatch(options, jobs, cache.store)
+        finally:
+            complete = cache.finish()
     if complete:
         print(f"wrote {', '.join(cache.files)}")
     return status
@@ -80,8 +81,13 @@ def _fill_volume(
     sharing = 1 if options.scheduler else options.workers
     memory = memory_beside_python(medium.max_memory or total_memory() // (2 * sharing))
     sweep: FarmSweep | None = None
+    work = Results(parts, names=[NAMES])
     try:
-        with terminated_like_interrupted(), connected(options) as connection:
+        with (
+            work.alone(resume=True),
+            terminated_like_interrupted(),
+            connected(options) as connection,
+        ):
 
             def begin(sigma_t: MappedField, inputs: str) -> FarmSweep:
                 nonlocal sweep
@@ -89,6 +95,7 @@ def _fill_volume(
                 return sweep
 
             medium.compute(scene, begin, None)
+            work.remove_all()
     except (IrrcacheError, OSError) as error:
         if sweep is None or sweep.has_folder:
             raise
@@ -97,7 +104,6 @@ def _fill_volume(
             f'-o "{file}" that has finished; see whether that file is there, otherwise start this '
             "command again."
         ) from error
-    shutil.rmtree(parts, ignore_errors=True)
     print(f"wrote {file}")
     return 0
 
@@ -106,10 +112,10 @@ def run_frames(args: argparse.Namespace) -> int:
     """Render the frames of a scene."""
     options, environment = _begin(args)
     results = Results(args.output)
-    results.begin(args.resume)
-    jobs = list(frame_jobs(args, *_scene(args), environment))
-    status = _dispatch(options, begin_frames(jobs, results), results.store)
-    there = sum(map(results.has, jobs))
+    with results.alone(args.resume):
+        jobs = list(frame_jobs(args, *_scene(args), environment))
+        status = _dispatch(options, begin_frames(jobs, results), results.store)
+        there = sum(map(results.has, jobs))
     print(f"{there} of {len(jobs)} frames are in {args.output}")
     if not status and there < len(jobs):
         print(
@@ -126,11 +132,12 @@ def run_reference(args: argparse.Namespace) -> int:
     """Render, or continue, a reference."""
     options, environment = _begin(args)
     scene, parameters, _ = _scene(args)
-    reference = _reference(args, scene, parameters, environment)
-    try:
-        status = _dispatch(options, reference.missing, reference.store)
-    finally:
-        reference.finish()
+    with ExitStack() as used:
+        reference = _reference(args, scene, parameters, environment, {}, used)
+        try:
+            status = _dispatch(options, reference.missing, reference.store)
+        finally:
+            reference.finish()
     if reference.found is not None:
         print(f"{2 * reference.found.spp} samples per pixel in two halves, {reference.path}")
     return status
@@ -140,17 +147,30 @@ def run_study(args: argparse.Namespace) -> int:
     """Measure all integrators on all scenes, and write a report for each scene."""
     options, environment = _begin(args, most_workers=1)
     integrators_of(args)
-    budgets, studies, references = budgets_of(args.budget), {}, {}
+    budgets = budgets_of(args.budget)
     Path(args.output).mkdir(exist_ok=True)
+    with ExitStack() as used:
+        return _study(args, options, environment, budgets, used)
+
+
+def _study(
+    args: argparse.Namespace,
+    options: ClusterOptions,
+    environment: Environment,
+    budgets: list[float],
+    used: ExitStack,
+) -> int:
+    """Measure and report; ``used`` keeps other commands from the folders until the end."""
+    studies, references = {}, {}
     jobs: list[Job] = []
     stores: dict[str, Store] = {}  # by names of jobs
     for own in arguments_by_scene(args):
         job = common_job(own)
         study = SceneStudy(own, job, budgets, environment)
+        used.enter_context(study.alone(args.resume))
         missing = study.begin(args.resume)
-        reference = _reference(args, Path(job["scene"]), job["parameters"], environment)
-        # Scenes with the same contents have the same reference.
-        studies[study] = references.setdefault(reference.path, reference)
+        place = Path(job["scene"]), job["parameters"]
+        studies[study] = _reference(args, *place, environment, references, used)
         stores |= {each.name: study.store for each in missing}
         jobs += missing
     for reference in references.values():
@@ -209,8 +229,16 @@ def _check_parent(file: Path) -> None:
 
 
 def _reference(
-    args: argparse.Namespace, scene: Path, parameters: dict[str, str], environment: Environment
+    args: argparse.Namespace,
+    scene: Path,
+    parameters: dict[str, str],
+    environment: Environment,
+    known: dict[Path, ReferenceRun],
+    used: ExitStack,
 ) -> ReferenceRun:
+    """Return the reference of a scene, which is one of those ``known`` where the contents are the
+    same; ``used`` keeps other commands from its folder.
+    """
     require_emission(scene, parameters, args.reference)
     arguments = scene_arguments(scene, parameters, args.reference)
     available = len(load_scene(scene, parameters, args.reference).sensors())
@@ -220,7 +248,11 @@ def _reference(
         )
     folder = (args.references or default_folder()).resolve()
     path = reference_path(scene, parameters, args.reference, args.sensor, folder)
-    return ReferenceRun(arguments, args.sensor, path, args.reference_spp, environment)
+    if path not in known:
+        used.enter_context(waiting_launches(path).alone(resume=True))
+        settings = args.sensor, path, args.reference_spp, environment
+        known[path] = ReferenceRun(arguments, *settings)
+    return known[path]
 
 
 def _dispatch(options: ClusterOptions, jobs: Sequence[Job], store: Store) -> int:

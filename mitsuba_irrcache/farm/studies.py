@@ -6,6 +6,7 @@ import argparse
 import copy
 import tempfile
 from collections import Counter
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 
@@ -34,6 +35,10 @@ class SceneStudy:
         self._job, self._folder = job, Path(args.output)
         self._results = Results(self._folder)
         self._checked: dict = {}
+
+    def alone(self, resume: bool) -> AbstractContextManager[None]:
+        """Return a context for all that follows: no other command writes to the folder."""
+        return self._results.alone(resume)
 
     def begin(self, resume: bool) -> list[Job]:
         """Check scene and integrators; return the jobs of measurements that remain."""

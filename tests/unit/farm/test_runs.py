@@ -17,6 +17,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm import runs, studies, volume, work
 from mitsuba_irrcache.farm.cluster import Connection
 from mitsuba_irrcache.farm.results import Outcome, Results
+from mitsuba_irrcache.farm.volume import NAMES
 from mitsuba_irrcache.farm.work import KINDS
 from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
@@ -200,7 +201,7 @@ def test_the_second_of_two_commands_for_one_volume_says_so(tmp_path, monkeypatch
 
     class Overtaken:
         def __init__(self, *_) -> None:
-            shutil.rmtree(next(folder.iterdir()))  # as halfway through the removal
+            shutil.rmtree(next(folder.glob(NAMES)))  # as halfway through the removal
 
         def run(self) -> None:
             raise IrrcacheError("some file does not exist")
@@ -213,3 +214,102 @@ def test_the_second_of_two_commands_for_one_volume_says_so(tmp_path, monkeypatch
     assert main(command) == 1
     said = capsys.readouterr().err
     assert "light.npy.parts" in said and "by another command" in said
+
+
+@pytest.fixture
+def volume_command(tmp_path, monkeypatch) -> list[str]:
+    """Return a command that sweeps a small volume in this process."""
+
+    class InTurn:
+        def __init__(self, _, jobs, store) -> None:
+            self.jobs, self.store = jobs, store
+
+        def run(self) -> dict[str, str]:
+            for job in self.jobs:
+                self.store(job, Outcome("here", digests=KINDS[job.kind](job.arguments, None)))
+            return {}
+
+    monkeypatch.setattr(runs, "connected", lambda _: nullcontext(Connection(None)))
+    monkeypatch.setattr(volume, "Dispatch", InTurn)
+    np.save(tmp_path / "density.npy", np.ones((8, 8, 8), np.float32))
+    (tmp_path / "scene.xml").write_text(VOLUME_IN_FILE)
+    return ["farm", "cache", str(tmp_path / "scene.xml"), "-o", str(tmp_path / "light.npy")]
+
+
+def test_files_of_others_beside_a_volume_stay(volume_command, tmp_path, capsys):
+    """A folder of others is refused, and one that they write to during the run is not removed."""
+    notes = tmp_path / "light.npy.parts" / "thesis.txt"
+    notes.parent.mkdir()
+    notes.write_text("precious")
+    assert main([*volume_command, "--resume"]) == 1
+    said = capsys.readouterr().err
+    assert f'"{notes.parent}" is not empty and holds no results of irrcache farm' in said
+    assert [*notes.parent.iterdir()] == [notes] and not (tmp_path / "light.npy").exists()
+    notes.unlink()
+    (notes.parent / "0123456789abcdef").mkdir()  # of an earlier run, of another scene
+    run = volume.Dispatch.run
+
+    def and_write(dispatch):
+        notes.write_text("precious")
+        return run(dispatch)
+
+    volume.Dispatch.run = and_write
+    assert main([*volume_command, "--resume"]) == 0
+    assert [*notes.parent.iterdir()] == [notes] and (tmp_path / "light.npy").exists()
+
+
+def of_kind(kind: str, folder: Path) -> list[str]:
+    """Return a command without its options of the output, and these."""
+    own = {
+        "cache": ["-o", str(folder / "light.cache"), "-i", "irrcache{resolution=4,cache_spp=64}"],
+        "frames": ["-o", str(folder / "frames"), "--spp", "1", "-i", "volpath"],
+        "reference": ["--references", str(folder / "references"), "--reference-spp", "4"],
+    }
+    return ["farm", kind, copied(folder / "scene"), *own[kind], *SMALL, "--resume"]
+
+
+@pytest.mark.parametrize("kind", ["cache", "frames", "reference"])
+def test_a_second_command_for_the_same_output_says_so(here, tmp_path, monkeypatch, capsys, kind):
+    """The first one is not disturbed."""
+    command = of_kind(kind, tmp_path)
+    second = []
+
+    class Meanwhile(Here):
+        def run(self) -> dict[str, str]:
+            monkeypatch.setattr(runs, "Dispatch", Here)
+            second.append(main(command))
+            return super().run()
+
+    monkeypatch.setattr(runs, "Dispatch", Meanwhile)
+    assert main(command) == 0 and second == [1]
+    said = capsys.readouterr()
+    assert "another command is using" in said.err and "--resume" in said.err
+    assert main(command) == 0  # nothing of either is in the way
+
+
+def test_a_second_command_for_the_same_volume_says_so(volume_command, monkeypatch, capsys):
+    second, run = [], volume.Dispatch.run
+
+    def meanwhile(dispatch) -> dict[str, str]:
+        monkeypatch.setattr(volume.Dispatch, "run", run)
+        second.append(main([*volume_command, "--resume"]))
+        return run(dispatch)
+
+    monkeypatch.setattr(volume.Dispatch, "run", meanwhile)
+    assert main(volume_command) == 0 and second == [1]
+    assert "another command is using" in capsys.readouterr().err
+
+
+def test_parts_without_records_are_no_obstacle(here, tmp_path):
+    """A command that is killed while it removes them may leave some."""
+    parts = tmp_path / "light.cache.parts"
+    parts.mkdir()
+    (parts / "batches-128-191.part").write_text("of an unknown job")
+    assert main(of_kind("cache", tmp_path)) == 0
+    assert not parts.exists() and (tmp_path / "light.cache").exists()
+
+
+def test_a_command_that_fails_leaves_no_folder(here, tmp_path):
+    frames = str(tmp_path / "frames")
+    assert main(["farm", "frames", str(tmp_path / "nope.xml"), "-o", frames]) == 1
+    assert not Path(frames).exists()
