@@ -87,6 +87,7 @@ class CacheRun:
                 "medium": number,
                 "first": first,
                 "count": count,
+                "batch": medium.cache.batch,
                 "file": f"{name}.part",
             }
             yield Job(name, "cache_part", arguments, self._environment)

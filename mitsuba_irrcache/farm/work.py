@@ -114,11 +114,12 @@ def set_up(environment: Environment) -> None:
 
 def cache_part(arguments: dict, folder: Path) -> None:
     """Compute consecutive batches of the cache of one medium."""
-    key = json.dumps([arguments["scene"], arguments["medium"]], sort_keys=True)
+    number, batch = arguments["medium"], arguments["batch"]
+    key = json.dumps([arguments["scene"], number, batch], sort_keys=True)
 
     def opened() -> StreamParts:
         scene = _loaded(arguments["scene"])
-        return StreamParts(scene, scene.integrator().cached_media(scene)[arguments["medium"]])
+        return StreamParts(scene, scene.integrator().cached_media(scene)[number], batch)
 
     parts = _SCENES.get(key, opened)
     part = parts.compute(arguments["first"], arguments["count"])

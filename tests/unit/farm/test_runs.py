@@ -300,6 +300,42 @@ def test_a_second_command_for_the_same_volume_says_so(volume_command, monkeypatc
     assert "another command is using" in capsys.readouterr().err
 
 
+def test_a_volume_that_is_changed_during_the_run_is_no_mixture(
+    volume_command, tmp_path, monkeypatch, capsys
+):
+    """The run fails, and the next one, of the new volume, finds what an undisturbed one does."""
+    density, run = tmp_path / "density.npy", volume.Dispatch.run
+
+    def meanwhile(dispatch) -> dict[str, str]:
+        np.save(density, np.full((8, 8, 8), 2, np.float32))
+        return run(dispatch)
+
+    with monkeypatch.context() as changing:
+        changing.setattr(volume.Dispatch, "run", meanwhile)
+        assert main(volume_command) == 1
+    assert f'"{density}" was changed while it was in use' in capsys.readouterr().err
+    light = tmp_path / "light.npy"
+    assert not light.exists()
+    assert main([*volume_command, "--resume"]) == 0
+    found = light.read_bytes()
+    light.unlink()
+    assert main(volume_command) == 0 and light.read_bytes() == found
+
+
+@pytest.mark.parametrize("solver", ["sweep", "path"])
+def test_a_cache_is_continued_with_the_batches_of_its_file(here, tmp_path, solver):
+    """More samples have larger batches by default; the file keeps those with which it began."""
+    scene, mine = copied(tmp_path / "scene"), tmp_path / "mine.cache"
+    integrator = f"irrcache{{solver={solver},resolution=4,cache_spp=%d}}"
+    command = ["farm", "cache", scene, "-o", str(mine), "-D", "size=8", "--resume", "-i"]
+    for samples in (64, 512):
+        assert main([*command, integrator % samples]) == 0
+        alone = integrator.replace("}", f",cache_file={tmp_path / 'alone.cache'}}}") % samples
+        loaded = load_scene(scene, {"size": "8"}, alone)
+        loaded.integrator().prepare(loaded)
+        assert mine.read_bytes() == (tmp_path / "alone.cache").read_bytes()
+
+
 def test_parts_without_records_are_no_obstacle(here, tmp_path):
     """A command that is killed while it removes them may leave some."""
     parts = tmp_path / "light.cache.parts"
