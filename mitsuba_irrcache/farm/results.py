@@ -239,12 +239,35 @@ class Results:
         for name in files:
             (self.folder / name).unlink(missing_ok=True)
 
+    def remove_others(self, jobs: Iterable[Job]) -> tuple[list[str], list[str]]:
+        """Remove the records of all jobs but these, and their files unless they were changed since.
+
+        Returns the names of removed files, and of those that stay.
+        """
+        names, removed, kept = {job.name for job in jobs}, [], []
+        for record in sorted(self._records.glob("*.json")):
+            if record.stem in names:
+                continue
+            for name, known in self._read(record)[1].items():
+                file = self.folder / name
+                with suppress(OSError):
+                    is_ours = _digest(file.read_bytes()) == known
+                    (removed if is_ours else kept).append(name)
+                    if is_ours:
+                        file.unlink()
+            record.unlink(missing_ok=True)
+        return sorted(removed), sorted(kept)
+
     def _known(self, job: Job) -> tuple[str, dict[str, str], dict[str, str]]:
         """Return the digests in the record of a job: of its inputs, "" without a readable record,
         of its files by name, and the `Outcome.digests`.
         """
+        return self._read(self._record(job))
+
+    @staticmethod
+    def _read(file: Path) -> tuple[str, dict[str, str], dict[str, str]]:
         try:
-            record = json.loads(self._record(job).read_text())
+            record = json.loads(file.read_text())
             return str(record["digest"]), dict(record["files"]), dict(record["digests"])
         except (OSError, ValueError, KeyError, TypeError):  # no record, or a damaged one
             return "", {}, {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from contextlib import nullcontext
 from dataclasses import replace
@@ -172,6 +173,31 @@ def test_no_image_of_other_inputs_stays_beside_those_of_a_run(frames, tmp_path, 
     assert sorted(path.name for path in Path("frames").glob("frame*")) == [
         "frame-0000.exr", "frame-0000.png",
     ]  # fmt: skip
+
+
+def test_no_image_stays_that_is_none_of_the_frames(frames, capsys):
+    """Of a longer run, or of other sensors; what others have written or changed stays."""
+    assert frames("--vary", "sigma_t=1:4:4", "-i", "volpath")[0] == 0
+    Path("frames/frame-0009.exr").write_text("mine")
+    Path("frames/frame-0002.png").write_text("edited")
+    capsys.readouterr()
+    assert frames("--vary", "sigma_t=1:3:2", "-i", "volpath", "--resume") == (0, ["frame-0001"])
+    said = capsys.readouterr().out
+    assert "no frames of this run: frame-0002.exr, frame-0003.exr, frame-0003.png\n" in said
+    assert "changed since an earlier one, and therefore left: frame-0002.png\n" in said
+    assert sorted(path.name for path in Path("frames").glob("frame*")) == [
+        "frame-0000.exr", "frame-0000.png", "frame-0001.exr", "frame-0001.png",
+        "frame-0002.png", "frame-0009.exr",
+    ]  # fmt: skip
+    assert frames("--vary", "sigma_t=1:3:2", "-i", "volpath", "--resume") == (0, [])
+    assert "no frames of" not in capsys.readouterr().out
+    Path("scene/scene.xml").write_text(
+        re.sub(r"(<sensor.*</sensor>)", r"\1\1", Path("scene/scene.xml").read_text(), flags=re.S)
+    )
+    assert frames("-i", "volpath", "--sensors", "all", "--resume")[0] == 0
+    assert not Path("frames/frame-0000.exr").exists()
+    assert frames("-i", "volpath", "--resume")[0] == 0
+    assert not [*Path("frames").glob("*-sensor-*")] and Path("frames/frame-0000.exr").exists()
 
 
 def test_a_run_without_all_its_frames_has_a_status(frames, monkeypatch, capsys):
