@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -34,8 +33,9 @@ from mitsuba_irrcache.io.scene_files import (
     parse_integrator,
     parse_parameters,
 )
-from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.memory import total_memory
+from mitsuba_irrcache.machine.modules import import_modules
+from mitsuba_irrcache.machine.variants import select_variant
 from mitsuba_irrcache.out_of_core.irradiance_file import check_replaceable
 from mitsuba_irrcache.out_of_core.rendering import memory_beside_python
 from mitsuba_irrcache.out_of_core.survey import MappedField
@@ -203,12 +203,9 @@ def _begin(
 ) -> tuple[ClusterOptions, Environment]:
     """Check the options of all runs, and set the variant."""
     options = ClusterOptions.of(args, most_workers)
-    if args.mode.startswith("llvm"):
-        require_llvm()
-    mi.set_variant(args.mode)
+    select_variant(args.mode)
     mi.set_log_level(mi.LogLevel.Warn)
-    for module in args.modules:
-        importlib.import_module(module)
+    import_modules(args.modules)
     return options, Environment.here(args.mode, args.modules, options.threads)
 
 

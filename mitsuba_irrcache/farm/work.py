@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import tempfile
 import threading
@@ -19,7 +18,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.cli.render import described
 from mitsuba_irrcache.compare.command import measure_integrator
 from mitsuba_irrcache.compare.reference import render_halves
-from mitsuba_irrcache.errors import original_message
+from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.farm import volume_jobs
 from mitsuba_irrcache.farm.jobs import (
     Environment,
@@ -35,6 +34,7 @@ from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
 from mitsuba_irrcache.machine.doctor import available_cores
 from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.machine.modules import import_modules
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.stream_parts import StreamParts
 
@@ -94,8 +94,6 @@ def set_up(environment: Environment) -> None:
         if mi.variant() != environment.variant:
             mi.set_variant(environment.variant)
         mi.set_log_level(mi.LogLevel.Error)
-        for module in environment.modules:
-            importlib.import_module(module)
         # With a single thread Mitsuba waits for ever when it reads an EXR file.
         threads = max(2, environment.threads or available_cores())
         if dr.thread_count() != threads:
@@ -104,6 +102,10 @@ def set_up(environment: Environment) -> None:
     except Exception as error:
         message = original_message(error)
         raise UnfitWorkerError(f"{environment.variant} cannot be used: {message}") from error
+    try:
+        import_modules(environment.modules)
+    except IrrcacheError as error:
+        raise UnfitWorkerError(str(error).rstrip(".")) from error
     for module, wanted in environment.sources:
         if source_digest(module) != wanted:
             raise UnfitWorkerError(

@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_irrcache.scenes import scene_path
@@ -375,3 +376,31 @@ def test_a_command_that_fails_leaves_no_folder(here, tmp_path):
     frames = str(tmp_path / "frames")
     assert main(["farm", "frames", str(tmp_path / "nope.xml"), "-o", frames]) == 1
     assert not Path(frames).exists()
+
+
+@pytest.mark.parametrize("name", ["no_such_module", "./mod.py"])
+def test_a_module_that_is_missing_is_named_in_one_line(tmp_path, capsys, name):
+    command = ["farm", "cache", copied(tmp_path / "a"), "-o", str(tmp_path / "light.cache")]
+    assert main([*command, "--import", name]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("irrcache: error: --import ") and name in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["render", "farm cache", "fit"])
+def test_a_variant_that_cannot_be_used_is_named_in_one_line(tmp_path, capsys, monkeypatch, command):
+    """Mitsuba raises an ImportError where there is no GPU."""
+
+    def fails(name: str) -> None:
+        raise ImportError(f"{name}: the CUDA backend hasn't been initialized.")
+
+    monkeypatch.setattr(mi, "set_variant", fails)
+    scene, image = copied(tmp_path / "a"), str(tmp_path / "a.exr")
+    write_image(image, np.zeros((8, 8, 3), np.float32), {})
+    own = ["--images", image] if command == "fit" else []
+    output = "folder" if command == "fit" else "light.cache" if "cache" in command else "b.exr"
+    arguments = [*command.split(), scene, *own, "-o", str(tmp_path / output), "-m", "cuda_ad_rgb"]
+    assert main(arguments) == 1
+    said = capsys.readouterr().err
+    assert 'error: -m is "cuda_ad_rgb", which cannot be used on this machine' in said
+    assert "irrcache doctor" in said and said.count("\n") == 1
