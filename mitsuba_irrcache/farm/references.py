@@ -7,13 +7,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mitsuba_irrcache.compare.reference import CHUNK, Reference, joined
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.jobs import Environment, Job
 from mitsuba_irrcache.farm.results import Checkpoints, OrderedParts, Outcome, Results
 
 
 def waiting_launches(path: Path) -> Results:
     """Return the launches that wait beside the file of a reference; create the folder of both."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise IrrcacheError(
+            f'cannot write to "{path.parent}" ({error.strerror}); name another folder by '
+            "--references."
+        ) from error
     return Results(path.with_name(f"{path.name}.parts"), names=[f"{glob.escape(path.stem)}-*.npz"])
 
 

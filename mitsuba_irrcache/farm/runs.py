@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import mitsuba as mi
@@ -47,7 +47,7 @@ def run_cache(args: argparse.Namespace) -> int:
     """Fill the caches of a scene."""
     options, environment = _begin(args)
     scene, parameters, integrator = _scene(args)
-    _check_parent(args.output)
+    _check_parent(args.output, scene)
     integrator = chosen_integrator(scene, parameters, integrator)
     loaded = load_scene(scene, parameters, integrator)
     if getattr(loaded.integrator(), "mapped_medium", None) is not None:
@@ -147,10 +147,30 @@ def run_study(args: argparse.Namespace) -> int:
     """Measure all integrators on all scenes, and write a report for each scene."""
     options, environment = _begin(args, most_workers=1)
     integrators_of(args)
-    budgets = budgets_of(args.budget)
-    Path(args.output).mkdir(exist_ok=True)
+    budgets, folder = budgets_of(args.budget), Path(args.output)
     with ExitStack() as used:
+        used.enter_context(_folder_of_others(folder))
         return _study(args, options, environment, budgets, used)
+
+
+@contextmanager
+def _folder_of_others(folder: Path) -> Iterator[None]:
+    """Create a folder for those of runs, and remove it in the end if it is empty."""
+    if folder.exists() and not folder.is_dir():
+        raise IrrcacheError(f'-o "{folder}" is a file; name a folder.')
+    if not folder.parent.is_dir():
+        raise IrrcacheError(f'cannot write "{folder}": "{folder.parent}" does not exist.')
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise IrrcacheError(f'cannot write "{folder}": {error.strerror}.') from error
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            if is_new:
+                folder.rmdir()
 
 
 def _study(
@@ -218,11 +238,14 @@ def _scene(args: argparse.Namespace) -> tuple[Path, dict[str, str], str | None]:
     return scene, parameters, integrator
 
 
-def _check_parent(file: Path) -> None:
+def _check_parent(file: Path, scene: Path) -> None:
+    """Raise IrrcacheError if a cache cannot be written to a file, which may be the ``scene``."""
     if not file.parent.is_dir():
         raise IrrcacheError(f'cannot write "{file}": the folder "{file.parent}" does not exist.')
     if file.is_dir():
         raise IrrcacheError(f'cannot write "{file}": it is a folder; name a file.')
+    if file.exists() and file.samefile(scene):
+        raise IrrcacheError(f'-o "{file}" is the scene itself; name another file for the cache.')
 
 
 def _reference(

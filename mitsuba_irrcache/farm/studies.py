@@ -43,12 +43,12 @@ class SceneStudy:
     def begin(self, resume: bool) -> list[Job]:
         """Check scene and integrators; return the jobs of measurements that remain."""
         self._results.begin(resume)
-        for name in FOLDERS:
-            (self._folder / name).mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="irrcache-farm-") as scratch:
             wanted = self._job | {"integrators": [*self._args.integrator, self._args.reference]}
             files = Path(scratch) / "checked.json", Path(scratch) / "log"
             self._checked = run_job("check", wanted, *files)
+        for name in FOLDERS:
+            (self._folder / name).mkdir(exist_ok=True)
         good = {measurement.name for measurement in self.measurements if not measurement.error}
         return [job for job in self._jobs if job.arguments["name"] not in good]
 

@@ -404,3 +404,35 @@ def test_a_variant_that_cannot_be_used_is_named_in_one_line(tmp_path, capsys, mo
     said = capsys.readouterr().err
     assert 'error: -m is "cuda_ad_rgb", which cannot be used on this machine' in said
     assert "irrcache doctor" in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("resume", [[], ["--resume"]])
+@pytest.mark.parametrize("name", ["scene.xml", "notes.txt"])
+def test_nobody_is_told_to_delete_what_is_no_cache(here, tmp_path, capsys, name, resume):
+    scene = Path(copied(tmp_path / "a"))
+    file = scene.with_name(name)
+    content = scene.read_text()
+    file.write_text(content)
+    assert main(["farm", "cache", str(scene), "-o", str(file), *resume]) == 1
+    said = capsys.readouterr().err
+    assert f'"{file}" is ' in said and "name another" in said and "delete it" not in said
+    assert file.read_text() == content
+
+
+def test_a_study_without_a_folder_says_so_and_leaves_none(tmp_path, capsys, monkeypatch):
+    def fails(*_):
+        raise IrrcacheError("there is no such integrator; name another.")
+
+    monkeypatch.setattr(studies, "run_job", fails)
+    scene = copied(tmp_path / "a")
+    for output, said in (
+        (tmp_path / "nope" / "x", f'cannot write "{tmp_path / "nope" / "x"}": "'),
+        (scene, f'-o "{scene}" is a file; name a folder.'),
+        (tmp_path / "x", "there is no such integrator"),
+    ):
+        assert main(["farm", "study", scene, "-i", "volpath", "-o", str(output)]) == 1
+        assert said in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    options = ["--references", f"{scene}/x", "--reference-spp", "4"]
+    assert main(["farm", "reference", scene, *options]) == 1
+    assert "name another folder by --references" in capsys.readouterr().err
