@@ -19,8 +19,6 @@ from mitsuba_irrcache.io.scene_files import load_scene
 
 #: Largest number of frames of one run; more are most likely a mistake, such as 0:1:1e9.
 MOST_FRAMES = 1_000_000
-#: Largest number of files that a message names.
-MOST_NAMES = 8
 
 
 def rows_of(variations: list[str], table: Path | None, folder: Path) -> list[dict[str, str]]:
@@ -191,8 +189,7 @@ def frame_jobs(
 
 def begin_frames(jobs: list[Job], results: Results) -> list[Job]:
     """Return the jobs of the frames that have to be rendered, and remove what an earlier run has
-    left of these: where one fails, no image of other inputs stays beside the others. Images of the
-    earlier run that are none of these frames are removed, too, with a message.
+    left of these: where one fails, no image of other inputs stays beside the others.
 
     A frame is finished if its inputs are the same, and each cache file that it names is missing, or
     is as it was after the frame had been rendered.
@@ -203,15 +200,6 @@ def begin_frames(jobs: list[Job], results: Results) -> list[Job]:
         image = results.folder / job.arguments["file"]
         for file in (image, image.with_suffix(".png")):  # the record may be damaged
             file.unlink(missing_ok=True)
-    removed, kept = results.remove_others(jobs)
-    for names, what in (
-        (removed, "removed, as they are no frames of this run"),
-        (kept, "no frames of this run, but changed since an earlier one, and therefore left"),
-    ):
-        if names:
-            more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-            shown = ", ".join(names[:MOST_NAMES])
-            print(f"{what}: {shown}{more}")
     return missing
 
 

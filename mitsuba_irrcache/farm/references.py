@@ -44,6 +44,7 @@ class ReferenceRun:
         self._parts = OrderedParts(self._results, jobs, self._add)
         self._parts.advance()
         self._checkpoints = Checkpoints()
+        self._is_finished = False
 
     @property
     def missing(self) -> list[Job]:
@@ -77,8 +78,11 @@ class ReferenceRun:
 
     def finish(self) -> bool:
         """Write the reference; return whether it is complete, and if so remove the folder."""
+        if self._is_finished:  # another command may be adding more samples
+            return True
         self.save()
         if not self._parts.is_complete:
             return False
         self._results.remove_all()
+        self._is_finished = True
         return True

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -28,8 +29,8 @@ except ImportError:  # Windows
 
 #: Name of the file in the folder of records that a command locks while it uses the folder.
 LOCK = "lock"
-#: Number of attempts to lock a folder that the command before may be removing just now.
-LOCK_ATTEMPTS = 100
+#: Time for which a command waits for another one that may end at once [s].
+LOCK_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,15 @@ class Results:
         What is empty in the end is removed. Raises IrrcacheError if another command is in such a
         context. File systems without locks let both of them in.
         """
-        is_new = not self.folder.exists()
-        with self._opened(resume) as lock:
-            self._take(lock)
+        is_new, deadline = not self.folder.exists(), time.monotonic() + LOCK_SECONDS
+        while (lock := self._locked(resume)) is None:
+            if time.monotonic() > deadline:
+                raise IrrcacheError(
+                    f'another command is using "{self.folder}"; when it has ended, start this one '
+                    "again with --resume, or name another output."
+                )
+            time.sleep(0.1)
+        with lock:
             try:
                 yield
             finally:
@@ -87,30 +94,28 @@ class Results:
                     with suppress(OSError):
                         folder.rmdir()
 
-    def _opened(self, resume: bool) -> BinaryIO:
-        """Create the folders, and open the file that `_take` locks."""
-        for _ in range(LOCK_ATTEMPTS):
-            self.begin(resume)
-            try:
-                return open(self._lock, "wb")
-            except FileNotFoundError:  # another command has just removed the folder
-                continue
-            except OSError as error:
-                raise IrrcacheError(f'cannot write "{self._lock}": {error.strerror}.') from error
-        raise self._in_use()
-
-    def _take(self, lock: BinaryIO) -> None:
-        """Lock a file; raise IrrcacheError if another command has locked it, or has removed it."""
-        if fcntl is None:
-            return
+    def _locked(self, resume: bool) -> BinaryIO | None:
+        """Create the folders, and return the file by which they are locked; None if another command
+        uses them, or is just removing them.
+        """
+        self.begin(resume)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock = open(self._lock, "wb")
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise IrrcacheError(f'cannot write "{self._lock}": {error.strerror}.') from error
+        try:
+            if fcntl is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if not self._is_named(lock):
+                    raise BlockingIOError
         except BlockingIOError:
-            raise self._in_use() from None
+            lock.close()
+            return None
         except OSError:  # there are no locks
-            return
-        if not self._is_named(lock):
-            raise self._in_use()
+            pass
+        return lock
 
     def _is_named(self, lock: BinaryIO) -> bool:
         """Return whether an open file is the one that other commands would lock."""
@@ -122,12 +127,6 @@ class Results:
     @property
     def _lock(self) -> Path:
         return self._records / LOCK
-
-    def _in_use(self) -> IrrcacheError:
-        return IrrcacheError(
-            f'another command is using "{self.folder}"; when it has ended, start this one again '
-            "with --resume, or name another output."
-        )
 
     def begin(self, resume: bool) -> None:
         """Create the folders; raise IrrcacheError if there are results that are not to be resumed,
@@ -239,24 +238,13 @@ class Results:
         for name in files:
             (self.folder / name).unlink(missing_ok=True)
 
-    def remove_others(self, jobs: Iterable[Job]) -> tuple[list[str], list[str]]:
-        """Remove the records of all jobs but these, and their files unless they were changed since.
-
-        Returns the names of removed files, and of those that stay.
-        """
-        names, removed, kept = {job.name for job in jobs}, [], []
-        for record in sorted(self._records.glob("*.json")):
-            if record.stem in names:
-                continue
-            for name, known in self._read(record)[1].items():
-                file = self.folder / name
-                with suppress(OSError):
-                    is_ours = _digest(file.read_bytes()) == known
-                    (removed if is_ours else kept).append(name)
-                    if is_ours:
-                        file.unlink()
-            record.unlink(missing_ok=True)
-        return sorted(removed), sorted(kept)
+    def others(self, jobs: Iterable[Job]) -> list[str]:
+        """Return the names of the files there of all jobs but these."""
+        names, found = {job.name for job in jobs}, []
+        for record in self._records.glob("*.json"):
+            if record.stem not in names:
+                found += [n for n in self._read(record)[1] if (self.folder / n).exists()]
+        return sorted(found)
 
     def _known(self, job: Job) -> tuple[str, dict[str, str], dict[str, str]]:
         """Return the digests in the record of a job: of its inputs, "" without a readable record,

@@ -40,6 +40,9 @@ from mitsuba_irrcache.out_of_core.irradiance_file import check_replaceable
 from mitsuba_irrcache.out_of_core.rendering import memory_beside_python
 from mitsuba_irrcache.out_of_core.survey import MappedField
 
+#: Largest number of files that a message names.
+MOST_NAMES = 8
+
 Store = Callable[[Job, Outcome], None]
 
 
@@ -115,8 +118,16 @@ def run_frames(args: argparse.Namespace) -> int:
     with results.alone(args.resume):
         jobs = list(frame_jobs(args, *_scene(args), environment))
         status = _dispatch(options, begin_frames(jobs, results), results.store)
-        there = sum(map(results.has, jobs))
+        there, others = sum(map(results.has, jobs)), results.others(jobs)
     print(f"{there} of {len(jobs)} frames are in {args.output}")
+    if others:
+        more = f" and {len(others) - MOST_NAMES} more" if len(others) > MOST_NAMES else ""
+        print(
+            f'irrcache: "{args.output}" also holds files of an earlier run that are no frames of '
+            f"this one, {', '.join(others[:MOST_NAMES])}{more}; delete them, or name another "
+            "folder.",
+            file=sys.stderr,
+        )
     if not status and there < len(jobs):
         print(
             f'irrcache: frames in "{args.output}" were changed meanwhile: another command may be '
@@ -149,12 +160,12 @@ def run_study(args: argparse.Namespace) -> int:
     integrators_of(args)
     budgets, folder = budgets_of(args.budget), Path(args.output)
     with ExitStack() as used:
-        used.enter_context(_folder_of_others(folder))
+        used.enter_context(_folder_of_runs(folder))
         return _study(args, options, environment, budgets, used)
 
 
 @contextmanager
-def _folder_of_others(folder: Path) -> Iterator[None]:
+def _folder_of_runs(folder: Path) -> Iterator[None]:
     """Create a folder for those of runs, and remove it in the end if it is empty."""
     if folder.exists() and not folder.is_dir():
         raise IrrcacheError(f'-o "{folder}" is a file; name a folder.')
@@ -257,7 +268,7 @@ def _reference(
     used: ExitStack,
 ) -> ReferenceRun:
     """Return the reference of a scene, which is one of those ``known`` where the contents are the
-    same; ``used`` keeps other commands from its folder.
+    same; ``used`` keeps other commands from its folder if there is anything to be computed.
     """
     require_emission(scene, parameters, args.reference)
     arguments = scene_arguments(scene, parameters, args.reference)
@@ -268,10 +279,16 @@ def _reference(
         )
     folder = (args.references or default_folder()).resolve()
     path = reference_path(scene, parameters, args.reference, args.sensor, folder)
-    if path not in known:
-        used.enter_context(waiting_launches(path).alone(resume=True))
+    if path in known:
+        return known[path]
+    with ExitStack() as alone:
+        alone.enter_context(waiting_launches(path).alone(resume=True))
         settings = args.sensor, path, args.reference_spp, environment
         known[path] = ReferenceRun(arguments, *settings)
+        if known[path].missing:
+            used.push(alone.pop_all())
+        else:  # others may use it, too
+            known[path].finish()
     return known[path]
 
 

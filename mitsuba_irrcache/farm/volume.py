@@ -59,7 +59,8 @@ class FarmSweep(SlabSweep):
         # Nothing is read that workers of an earlier run, of other inputs, may still be writing.
         digest = hashlib.sha256(json.dumps(settings).encode()).hexdigest()
         own = folder.resolve() / digest[:DIGITS]
-        self._results = Results(own, "finished")
+        # All files there are of runs, also where a command was killed while it removed them.
+        self._results = Results(own, "finished", names=["*"])
         folder.mkdir(exist_ok=True)
         self._results.begin(resume=True)
         super().__init__(sigma_t, own, _memory_of_first_run(own, memory))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import shutil
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from mitsuba_irrcache.compare.results import Measurement, Snapshot
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm import runs, studies, volume, work
 from mitsuba_irrcache.farm.cluster import Connection
+from mitsuba_irrcache.farm.jobs import Environment
+from mitsuba_irrcache.farm.references import waiting_launches
 from mitsuba_irrcache.farm.results import Outcome, Results
 from mitsuba_irrcache.farm.volume import NAMES
 from mitsuba_irrcache.farm.work import KINDS
@@ -176,29 +179,29 @@ def test_no_image_of_other_inputs_stays_beside_those_of_a_run(frames, tmp_path, 
     ]  # fmt: skip
 
 
-def test_no_image_stays_that_is_none_of_the_frames(frames, capsys):
-    """Of a longer run, or of other sensors; what others have written or changed stays."""
+def test_images_that_are_none_of_the_frames_are_named(frames, capsys):
+    """Those of a longer run, or of other sensors, until they are deleted."""
     assert frames("--vary", "sigma_t=1:4:4", "-i", "volpath")[0] == 0
+    assert "no frames" not in capsys.readouterr().err
     Path("frames/frame-0009.exr").write_text("mine")
-    Path("frames/frame-0002.png").write_text("edited")
-    capsys.readouterr()
-    assert frames("--vary", "sigma_t=1:3:2", "-i", "volpath", "--resume") == (0, ["frame-0001"])
-    said = capsys.readouterr().out
-    assert "no frames of this run: frame-0002.exr, frame-0003.exr, frame-0003.png\n" in said
-    assert "changed since an earlier one, and therefore left: frame-0002.png\n" in said
-    assert sorted(path.name for path in Path("frames").glob("frame*")) == [
-        "frame-0000.exr", "frame-0000.png", "frame-0001.exr", "frame-0001.png",
-        "frame-0002.png", "frame-0009.exr",
-    ]  # fmt: skip
-    assert frames("--vary", "sigma_t=1:3:2", "-i", "volpath", "--resume") == (0, [])
-    assert "no frames of" not in capsys.readouterr().out
+    fewer = ["--vary", "sigma_t=1:3:2", "-i", "volpath", "--resume"]
+    for expected in (["frame-0001"], []):
+        assert frames(*fewer) == (0, expected)
+        said = capsys.readouterr().err
+        assert (
+            '"frames" also holds files of an earlier run that are no frames of this one, ' in said
+        )
+        assert ", frame-0002.exr, frame-0002.png, frame-0003.exr, frame-0003.png; delete" in said
+    for file in [*Path("frames").glob("frame-000[23].*")]:
+        file.unlink()
+    assert frames(*fewer) == (0, []) and "no frames" not in capsys.readouterr().err
     Path("scene/scene.xml").write_text(
         re.sub(r"(<sensor.*</sensor>)", r"\1\1", Path("scene/scene.xml").read_text(), flags=re.S)
     )
     assert frames("-i", "volpath", "--sensors", "all", "--resume")[0] == 0
-    assert not Path("frames/frame-0000.exr").exists()
+    assert "one, frame-0000.exr, " in capsys.readouterr().err
     assert frames("-i", "volpath", "--resume")[0] == 0
-    assert not [*Path("frames").glob("*-sensor-*")] and Path("frames/frame-0000.exr").exists()
+    assert "frame-0000-sensor-1.png" in capsys.readouterr().err
 
 
 def test_a_run_without_all_its_frames_has_a_status(frames, monkeypatch, capsys):
@@ -312,6 +315,28 @@ def test_a_second_command_for_the_same_output_says_so(here, tmp_path, monkeypatc
     said = capsys.readouterr()
     assert "another command is using" in said.err and "--resume" in said.err
     assert main(command) == 0  # nothing of either is in the way
+
+
+def test_a_reference_that_is_complete_is_shared(here, tmp_path):
+    """A command that only reads it keeps nobody from adding samples, nor does it disturb that."""
+    scene, folder = copied(tmp_path / "scene"), str(tmp_path / "references")
+
+    def reference(spp: int) -> int:
+        options = ["--references", folder, "--reference-spp", str(spp), *SMALL]
+        return main(["farm", "reference", scene, *options])
+
+    assert reference(4) == 0
+    (path,) = Path(folder).glob("*.npz")
+    with ExitStack() as used:
+        args = argparse.Namespace(
+            reference="volpath", sensor=0, references=Path(folder), reference_spp=4
+        )
+        place = Path(scene), {"size": "8", "max_depth": "3"}
+        own = runs._reference(args, *place, Environment.here("llvm_ad_rgb", [], 0), {}, used)
+        assert not own.missing and own.path == path.resolve()
+        assert reference(8) == 0
+        with waiting_launches(own.path).alone(resume=True):
+            assert own.finish() and Path(f"{own.path}.parts").exists()
 
 
 def test_a_second_command_for_the_same_volume_says_so(volume_command, monkeypatch, capsys):
