@@ -173,9 +173,15 @@ def _check_values(sums: tuple[np.ndarray, ...], moments: np.ndarray) -> None:
 
 
 def unreadable(path: str | Path, error: Exception) -> CacheFileError:
-    """Return the error for a file that is damaged or not a cache."""
+    """Return the error for a file that is damaged, or no cache, which nobody is told to delete."""
+    try:
+        with open(path, "rb") as file:
+            may_be_one = file.read(2) in (b"PK", b"")  # an archive of arrays, or cut to nothing
+    except OSError:
+        may_be_one = False
+    remedy = "delete it if it is a damaged one, or name" if may_be_one else "name"
     return CacheFileError(
-        f'"{path}" is not a readable irradiance cache ({reason(error)}); delete it or name another '
+        f'"{path}" is not a readable irradiance cache ({reason(error)}); {remedy} another '
         "cache_file."
     )
 

@@ -23,7 +23,7 @@ from mitsuba_irrcache.io.scene_files import (
     load_scene,
     parse_parameters,
 )
-from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.machine.variants import select_variant
 
 #: The integrator in place of a path tracer; only this solver has gradients.
 INTEGRATOR = "irrcache{solver=sweep}"
@@ -110,9 +110,7 @@ def run(args: argparse.Namespace) -> int:
     files = _image_files(args.images)
     shared = {name: getattr(args, name) for name in Settings.__dataclass_fields__}
     settings, output = Settings(**shared), Path(args.output)
-    if args.mode.startswith("llvm"):
-        require_llvm()
-    mi.set_variant(args.mode)
+    select_variant(args.mode)
     mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
     parameters = parse_parameters(args.define)
     integrator = args.integrator

@@ -28,8 +28,7 @@ from mitsuba_irrcache.io.scene_files import (
     parse_integrator,
     parse_parameters,
 )
-from mitsuba_irrcache.machine.llvm import require_llvm
-from mitsuba_irrcache.machine.variants import SUPPORTED
+from mitsuba_irrcache.machine.variants import SUPPORTED, select_variant
 from mitsuba_irrcache.pipeline.progressive import Frame, render_progressive
 
 #: Stock integrators that ``irrcache`` replaces when a scene uses one of them.
@@ -130,9 +129,7 @@ def run(args: argparse.Namespace) -> int:
             f"--spp is {args.spp}; it must be at least 1 (or 0 for the scene's own)."
         )
     _check_targets(args)
-    if args.mode.startswith("llvm"):
-        require_llvm()
-    mi.set_variant(args.mode)
+    select_variant(args.mode)
     mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
     seconds: dict[str, float] = {}
     display = StageDisplay()

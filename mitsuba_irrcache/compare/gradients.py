@@ -25,6 +25,7 @@ import numpy as np
 from mitsuba_irrcache.core.argument_types import whole
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.scene_files import key_of, parse_parameters, unknown_properties
+from mitsuba_irrcache.machine.variants import select_variant
 
 from .command import budgets_of
 from .metrics import net_mse, root
@@ -189,7 +190,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant of Mitsuba")
     parser.add_argument("-D", "--define", action="append", default=[], metavar="KEY=VALUE")
     options = parser.parse_args(arguments)
-    mi.set_variant(options.mode)
+    select_variant(options.mode)
     mi.set_log_level(mi.LogLevel.Error)
     *subjects, reference = (
         Subject(Path(options.scene), parse_parameters(options.define), own, options.sensor)

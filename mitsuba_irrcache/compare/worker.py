@@ -7,7 +7,6 @@ report the progress.
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import signal
@@ -21,7 +20,8 @@ import mitsuba as mi
 
 from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.io.images import write_image
-from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.machine.modules import import_modules
+from mitsuba_irrcache.machine.variants import select_variant
 
 from . import runners
 from .metrics import colours
@@ -181,16 +181,9 @@ def _subject(job: dict, integrator: str) -> Subject:
 
 def _set_up(job: dict) -> None:
     """Set up the variant, the log and the modules that register other plugins."""
-    if job["variant"] not in mi.variants():
-        raise IrrcacheError(
-            f'Mitsuba has no variant "{job["variant"]}"; it has {", ".join(mi.variants())}.'
-        )
-    if job["variant"].startswith("llvm"):
-        require_llvm()
-    mi.set_variant(job["variant"])
+    select_variant(job["variant"])
     mi.set_log_level(mi.LogLevel.Error)
-    for module in job["modules"]:
-        importlib.import_module(module)
+    import_modules(job["modules"])
 
 
 KINDS = {"check": check, "reference": make_reference, "measure": measure, "start": start}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +13,14 @@ from mitsuba_irrcache.farm.jobs import Environment, Job
 from mitsuba_irrcache.farm.results import Checkpoints, OrderedParts, Outcome, Results
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.stream_parts import missing_parts
+
+#: Patterns of the names of parts that wait.
+PARTS = ("batches-*.part", "medium-*-batches-*.part")
+
+
+def waiting_parts(file: Path) -> Results:
+    """Return the parts that wait beside the file of a cache."""
+    return Results(file.with_name(f"{file.name}.parts"), names=PARTS)
 
 
 class CacheRun:
@@ -33,7 +40,7 @@ class CacheRun:
         ``resume``.
         """
         self._arguments, self._environment = scene, environment
-        self._results = Results(file.with_name(f"{file.name}.parts"))
+        self._results = waiting_parts(file)
         self._scene = loaded
         integrator = loaded.integrator()
         if not hasattr(integrator, "cached_media"):
@@ -80,6 +87,7 @@ class CacheRun:
                 "medium": number,
                 "first": first,
                 "count": count,
+                "batch": medium.cache.batch,
                 "file": f"{name}.part",
             }
             yield Job(name, "cache_part", arguments, self._environment)
@@ -110,5 +118,5 @@ class CacheRun:
         self.save()
         if not all(parts.is_complete for parts in self._parts.values()):
             return False
-        shutil.rmtree(self._results.folder, ignore_errors=True)
+        self._results.remove_all()
         return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import logging
 import math
@@ -138,10 +139,12 @@ def connected(options: ClusterOptions) -> Iterator[Connection]:
         if options.scheduler:
             address = _address(options.scheduler)
             try:
+                asyncio.run(_greeted(address, security))
                 client = Client(address, security=security, timeout=PATIENCE)
-            except (OSError, ValueError) as error:
+            except Exception as error:  # Dask raises exceptions of any type
+                why = reason(error) or f"nothing that it understands within {PATIENCE:g} s"
                 raise IrrcacheError(
-                    f'no scheduler answers at "{options.scheduler}" ({reason(error)}); start one '
+                    f'no scheduler answers at "{options.scheduler}" ({why}); start one '
                     'with "dask scheduler", or leave --scheduler out.'
                 ) from error
             with client:
@@ -152,6 +155,21 @@ def connected(options: ClusterOptions) -> Iterator[Connection]:
             _announce(client)
             _refill(cluster, options.workers)
             yield Connection(client, lambda: _refill(cluster, options.workers), LONGEST_START)
+
+
+async def _greeted(address: str, security: Security | None) -> None:
+    """Exchange greetings with a scheduler, within `PATIENCE`.
+
+    A client would wait for ever for those of another program, as of a web server.
+    """
+    from distributed import Security
+    from distributed.comm import connect
+
+    arguments = (security or Security()).get_connection_args("client")
+    greeting = connect(address, timeout=PATIENCE, **arguments)
+    # A little longer than the connection, whose own error says more.
+    comm = await asyncio.wait_for(greeting, 1.05 * PATIENCE)
+    comm.abort()
 
 
 def _local(options: ClusterOptions, security: Security | None) -> LocalCluster:

@@ -136,8 +136,13 @@ def sensors_of(text: str, available: int) -> list[int]:
         chosen = [int(part) for part in text.split(",")]
     except ValueError:
         chosen = [-1]
-    wrong = [index for index in chosen if not 0 <= index < available]
-    if wrong or len(set(chosen)) < len(chosen):
+    repeated = sorted({index for index in chosen if chosen.count(index) > 1})
+    if repeated:
+        raise IrrcacheError(
+            f'--sensors is "{text}", which names {", ".join(map(str, repeated))} more than once; '
+            "write each index once."
+        )
+    if any(not 0 <= index < available for index in chosen):
         raise IrrcacheError(
             f'--sensors is "{text}", but the scene has {available} sensor(s), counted from 0; '
             'write a list such as 0,2, or "all".'

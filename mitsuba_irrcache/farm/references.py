@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-import shutil
+import glob
 from collections.abc import Iterator
 from pathlib import Path
 
 from mitsuba_irrcache.compare.reference import CHUNK, Reference, joined
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.jobs import Environment, Job
 from mitsuba_irrcache.farm.results import Checkpoints, OrderedParts, Outcome, Results
+
+
+def waiting_launches(path: Path) -> Results:
+    """Return the launches that wait beside the file of a reference; create the folder of both."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise IrrcacheError(
+            f'cannot write to "{path.parent}" ({error.strerror}); name another folder by '
+            "--references."
+        ) from error
+    return Results(path.with_name(f"{path.name}.parts"), names=[f"{glob.escape(path.stem)}-*.npz"])
 
 
 class ReferenceRun:
@@ -23,8 +36,7 @@ class ReferenceRun:
         """``scene`` is a result of `scene_arguments`; ``path`` one of `reference_path`; ``spp`` are
         the samples per pixel of each half. An existing reference is continued.
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self.path, self._results = path, Results(path.with_name(f"{path.name}.parts"))
+        self.path, self._results = path, waiting_launches(path)
         self.found = Reference.load(path) if path.exists() else None
         self._saved = 0 if self.found is None else self.found.spp
         self._results.begin(resume=True)
@@ -32,6 +44,7 @@ class ReferenceRun:
         self._parts = OrderedParts(self._results, jobs, self._add)
         self._parts.advance()
         self._checkpoints = Checkpoints()
+        self._is_finished = False
 
     @property
     def missing(self) -> list[Job]:
@@ -65,8 +78,11 @@ class ReferenceRun:
 
     def finish(self) -> bool:
         """Write the reference; return whether it is complete, and if so remove the folder."""
+        if self._is_finished:  # another command may be adding more samples
+            return True
         self.save()
         if not self._parts.is_complete:
             return False
-        shutil.rmtree(self._results.folder, ignore_errors=True)
+        self._results.remove_all()
+        self._is_finished = True
         return True

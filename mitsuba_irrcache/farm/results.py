@@ -4,18 +4,33 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shutil
+import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from fnmatch import fnmatch
 from pathlib import Path
 from time import perf_counter
+from typing import BinaryIO
 
 from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.jobs import Job
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.pipeline.builder import CHECKPOINT_SECONDS, CHECKPOINT_SHARE
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+#: Name of the file in the folder of records that a command locks while it uses the folder.
+LOCK = "lock"
+#: Time for which a command waits for another one that may end at once [s].
+LOCK_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
@@ -47,9 +62,71 @@ class Results:
     digest of the job's inputs, those of its files, and the `Outcome.digests`.
     """
 
-    def __init__(self, folder: Path, records: str = ".farm") -> None:
-        """``records`` is the name of the folder in ``folder`` that holds them."""
-        self.folder, self._records = folder, folder / records
+    def __init__(self, folder: Path, records: str = ".farm", names: Sequence[str] = ()) -> None:
+        """``records`` is the name of the folder in ``folder`` that holds them; ``names`` are
+        patterns of all other names that runs write to ``folder``, if it is removed in the end.
+        """
+        self.folder, self._records, self._names = folder, folder / records, tuple(names)
+
+    @contextmanager
+    def alone(self, resume: bool) -> Iterator[None]:
+        """Return a context in which no other command uses the folder; `begin` is called first.
+
+        What is empty in the end is removed. Raises IrrcacheError if another command is in such a
+        context. File systems without locks let both of them in.
+        """
+        is_new, deadline = not self.folder.exists(), time.monotonic() + LOCK_SECONDS
+        while (lock := self._locked(resume)) is None:
+            if time.monotonic() > deadline:
+                raise IrrcacheError(
+                    f'another command is using "{self.folder}"; when it has ended, start this one '
+                    "again with --resume, or name another output."
+                )
+            time.sleep(0.1)
+        with lock:
+            try:
+                yield
+            finally:
+                with suppress(OSError):
+                    if self._is_named(lock):
+                        self._lock.unlink()
+                for folder in (self._records, *([self.folder] if is_new else [])):
+                    with suppress(OSError):
+                        folder.rmdir()
+
+    def _locked(self, resume: bool) -> BinaryIO | None:
+        """Create the folders, and return the file by which they are locked; None if another command
+        uses them, or is just removing them.
+        """
+        self.begin(resume)
+        try:
+            lock = open(self._lock, "wb")
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise IrrcacheError(f'cannot write "{self._lock}": {error.strerror}.') from error
+        try:
+            if fcntl is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if not self._is_named(lock):
+                    raise BlockingIOError
+        except BlockingIOError:
+            lock.close()
+            return None
+        except OSError:  # there are no locks
+            pass
+        return lock
+
+    def _is_named(self, lock: BinaryIO) -> bool:
+        """Return whether an open file is the one that other commands would lock."""
+        try:
+            return os.path.samestat(os.fstat(lock.fileno()), os.stat(self._lock))
+        except FileNotFoundError:
+            return False
+
+    @property
+    def _lock(self) -> Path:
+        return self._records / LOCK
 
     def begin(self, resume: bool) -> None:
         """Create the folders; raise IrrcacheError if there are results that are not to be resumed,
@@ -66,12 +143,44 @@ class Results:
                 f'"{self.folder}" holds results of an earlier run; add --resume to continue it, '
                 "or name another folder."
             )
-        if not self._records.is_dir() and self.folder.is_dir() and any(self.folder.iterdir()):
+        if not self._records.is_dir() and (others := self._others()):
             raise IrrcacheError(
-                f'"{self.folder}" is not empty and holds no results of irrcache farm; name another '
-                "folder."
+                f'"{self.folder}" is not empty and holds no results of irrcache farm, but '
+                f'"{others[0]}"; name another folder.'
             )
-        self._records.mkdir(parents=True, exist_ok=True)
+        try:
+            self._records.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise IrrcacheError(f'cannot write "{self.folder}": {error.strerror}.') from error
+
+    def _others(self) -> list[str]:
+        """Return the names in the folder that runs do not write, whatever their records."""
+        if not self.folder.is_dir():
+            return []
+        found = sorted(path.name for path in self.folder.iterdir() if path != self._records)
+        return [name for name in found if not self._is_own(name)]
+
+    def _is_own(self, name: str) -> bool:
+        """Return whether runs write this name, or its temporary file (see `atomic_write`)."""
+        return any(fnmatch(name, own) or fnmatch(name, f".{own}.*.tmp") for own in self._names)
+
+    def remove_all(self) -> None:
+        """Remove all that runs write, and the folder unless it holds anything else.
+
+        Records are removed last, so that another run continues where this is interrupted.
+        """
+        with suppress(OSError):
+            for path in [path for path in self.folder.iterdir() if self._is_own(path.name)]:
+                if path.is_dir():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
+            for record in self._records.iterdir():
+                if record.name != LOCK:
+                    record.unlink(missing_ok=True)
+            self._lock.unlink(missing_ok=True)  # whoever comes next makes its own
+            self._records.rmdir()
+            self.folder.rmdir()
 
     @property
     def has_folder(self) -> bool:
@@ -81,7 +190,7 @@ class Results:
     @property
     def has_any(self) -> bool:
         """Whether there is any finished job."""
-        return self._records.is_dir() and any(self._records.iterdir())
+        return self._records.is_dir() and any(self._records.glob("*.json"))
 
     def has(self, job: Job) -> bool:
         """Return whether the job has finished with the same inputs, and its files are unchanged."""
@@ -98,7 +207,16 @@ class Results:
         return self._known(job)[2]
 
     def store(self, job: Job, outcome: Outcome) -> None:
-        """Write the files of a job, then its record."""
+        """Write the files of a job, then its record.
+
+        Raises IrrcacheError where the folder is gone: files without records would be of no use.
+        """
+        if not self.has_folder:
+            raise IrrcacheError(
+                f'the folder "{self.folder}" was removed during the run, as by another command for '
+                "the same output that has finished; see whether that is there, otherwise start "
+                "this command again with --resume."
+            )
         self._record(job).unlink(missing_ok=True)
         for name, content in outcome.files.items():
             (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -120,12 +238,24 @@ class Results:
         for name in files:
             (self.folder / name).unlink(missing_ok=True)
 
+    def others(self, jobs: Iterable[Job]) -> list[str]:
+        """Return the names of the files there of all jobs but these."""
+        names, found = {job.name for job in jobs}, []
+        for record in self._records.glob("*.json"):
+            if record.stem not in names:
+                found += [n for n in self._read(record)[1] if (self.folder / n).exists()]
+        return sorted(found)
+
     def _known(self, job: Job) -> tuple[str, dict[str, str], dict[str, str]]:
         """Return the digests in the record of a job: of its inputs, "" without a readable record,
         of its files by name, and the `Outcome.digests`.
         """
+        return self._read(self._record(job))
+
+    @staticmethod
+    def _read(file: Path) -> tuple[str, dict[str, str], dict[str, str]]:
         try:
-            record = json.loads(self._record(job).read_text())
+            record = json.loads(file.read_text())
             return str(record["digest"]), dict(record["files"]), dict(record["digests"])
         except (OSError, ValueError, KeyError, TypeError):  # no record, or a damaged one
             return "", {}, {}

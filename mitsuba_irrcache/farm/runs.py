@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import importlib
-import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import mitsuba as mi
@@ -19,26 +18,30 @@ from mitsuba_irrcache.compare.reference import (
     require_emission,
 )
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.farm.cache import CacheRun
+from mitsuba_irrcache.farm.cache import CacheRun, waiting_parts
 from mitsuba_irrcache.farm.cluster import MOST_WORKERS, ClusterOptions, connected
 from mitsuba_irrcache.farm.dispatch import Dispatch
 from mitsuba_irrcache.farm.frames import begin_frames, frame_jobs
 from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
-from mitsuba_irrcache.farm.references import ReferenceRun
+from mitsuba_irrcache.farm.references import ReferenceRun, waiting_launches
 from mitsuba_irrcache.farm.results import Outcome, Results
 from mitsuba_irrcache.farm.studies import SceneStudy, arguments_by_scene
-from mitsuba_irrcache.farm.volume import FarmSweep
+from mitsuba_irrcache.farm.volume import NAMES, FarmSweep
 from mitsuba_irrcache.io.scene_files import (
     check_scene_file,
     load_scene,
     parse_integrator,
     parse_parameters,
 )
-from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.memory import total_memory
+from mitsuba_irrcache.machine.modules import import_modules
+from mitsuba_irrcache.machine.variants import select_variant
 from mitsuba_irrcache.out_of_core.irradiance_file import check_replaceable
 from mitsuba_irrcache.out_of_core.rendering import memory_beside_python
 from mitsuba_irrcache.out_of_core.survey import MappedField
+
+#: Largest number of files that a message names.
+MOST_NAMES = 8
 
 Store = Callable[[Job, Outcome], None]
 
@@ -47,18 +50,19 @@ def run_cache(args: argparse.Namespace) -> int:
     """Fill the caches of a scene."""
     options, environment = _begin(args)
     scene, parameters, integrator = _scene(args)
-    _check_parent(args.output)
+    _check_parent(args.output, scene)
     integrator = chosen_integrator(scene, parameters, integrator)
     loaded = load_scene(scene, parameters, integrator)
     if getattr(loaded.integrator(), "mapped_medium", None) is not None:
         return _fill_volume(args, options, environment, loaded)
     arguments = scene_arguments(scene, parameters, integrator)
-    cache = CacheRun(arguments, loaded, environment, args.output, args.resume)
-    jobs = cache.begin()
-    try:
-        status = _dispatch(options, jobs, cache.store)
-    finally:
-        complete = cache.finish()
+    with waiting_parts(args.output).alone(resume=True):
+        cache = CacheRun(arguments, loaded, environment, args.output, args.resume)
+        jobs = cache.begin()
+        try:
+            status = _dispatch(options, jobs, cache.store)
+        finally:
+            complete = cache.finish()
     if complete:
         print(f"wrote {', '.join(cache.files)}")
     return status
@@ -80,8 +84,13 @@ def _fill_volume(
     sharing = 1 if options.scheduler else options.workers
     memory = memory_beside_python(medium.max_memory or total_memory() // (2 * sharing))
     sweep: FarmSweep | None = None
+    work = Results(parts, names=[NAMES])
     try:
-        with terminated_like_interrupted(), connected(options) as connection:
+        with (
+            work.alone(resume=True),
+            terminated_like_interrupted(),
+            connected(options) as connection,
+        ):
 
             def begin(sigma_t: MappedField, inputs: str) -> FarmSweep:
                 nonlocal sweep
@@ -89,6 +98,7 @@ def _fill_volume(
                 return sweep
 
             medium.compute(scene, begin, None)
+            work.remove_all()
     except (IrrcacheError, OSError) as error:
         if sweep is None or sweep.has_folder:
             raise
@@ -97,7 +107,6 @@ def _fill_volume(
             f'-o "{file}" that has finished; see whether that file is there, otherwise start this '
             "command again."
         ) from error
-    shutil.rmtree(parts, ignore_errors=True)
     print(f"wrote {file}")
     return 0
 
@@ -106,11 +115,19 @@ def run_frames(args: argparse.Namespace) -> int:
     """Render the frames of a scene."""
     options, environment = _begin(args)
     results = Results(args.output)
-    results.begin(args.resume)
-    jobs = list(frame_jobs(args, *_scene(args), environment))
-    status = _dispatch(options, begin_frames(jobs, results), results.store)
-    there = sum(map(results.has, jobs))
+    with results.alone(args.resume):
+        jobs = list(frame_jobs(args, *_scene(args), environment))
+        status = _dispatch(options, begin_frames(jobs, results), results.store)
+        there, others = sum(map(results.has, jobs)), results.others(jobs)
     print(f"{there} of {len(jobs)} frames are in {args.output}")
+    if others:
+        more = f" and {len(others) - MOST_NAMES} more" if len(others) > MOST_NAMES else ""
+        print(
+            f'irrcache: "{args.output}" also holds files of an earlier run that are no frames of '
+            f"this one, {', '.join(others[:MOST_NAMES])}{more}; delete them, or name another "
+            "folder.",
+            file=sys.stderr,
+        )
     if not status and there < len(jobs):
         print(
             f'irrcache: frames in "{args.output}" were changed meanwhile: another command may be '
@@ -126,11 +143,12 @@ def run_reference(args: argparse.Namespace) -> int:
     """Render, or continue, a reference."""
     options, environment = _begin(args)
     scene, parameters, _ = _scene(args)
-    reference = _reference(args, scene, parameters, environment)
-    try:
-        status = _dispatch(options, reference.missing, reference.store)
-    finally:
-        reference.finish()
+    with ExitStack() as used:
+        reference = _reference(args, scene, parameters, environment, {}, used)
+        try:
+            status = _dispatch(options, reference.missing, reference.store)
+        finally:
+            reference.finish()
     if reference.found is not None:
         print(f"{2 * reference.found.spp} samples per pixel in two halves, {reference.path}")
     return status
@@ -140,17 +158,50 @@ def run_study(args: argparse.Namespace) -> int:
     """Measure all integrators on all scenes, and write a report for each scene."""
     options, environment = _begin(args, most_workers=1)
     integrators_of(args)
-    budgets, studies, references = budgets_of(args.budget), {}, {}
-    Path(args.output).mkdir(exist_ok=True)
+    budgets, folder = budgets_of(args.budget), Path(args.output)
+    with ExitStack() as used:
+        used.enter_context(_folder_of_runs(folder))
+        return _study(args, options, environment, budgets, used)
+
+
+@contextmanager
+def _folder_of_runs(folder: Path) -> Iterator[None]:
+    """Create a folder for those of runs, and remove it in the end if it is empty."""
+    if folder.exists() and not folder.is_dir():
+        raise IrrcacheError(f'-o "{folder}" is a file; name a folder.')
+    if not folder.parent.is_dir():
+        raise IrrcacheError(f'cannot write "{folder}": "{folder.parent}" does not exist.')
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise IrrcacheError(f'cannot write "{folder}": {error.strerror}.') from error
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            if is_new:
+                folder.rmdir()
+
+
+def _study(
+    args: argparse.Namespace,
+    options: ClusterOptions,
+    environment: Environment,
+    budgets: list[float],
+    used: ExitStack,
+) -> int:
+    """Measure and report; ``used`` keeps other commands from the folders until the end."""
+    studies, references = {}, {}
     jobs: list[Job] = []
     stores: dict[str, Store] = {}  # by names of jobs
     for own in arguments_by_scene(args):
         job = common_job(own)
         study = SceneStudy(own, job, budgets, environment)
+        used.enter_context(study.alone(args.resume))
         missing = study.begin(args.resume)
-        reference = _reference(args, Path(job["scene"]), job["parameters"], environment)
-        # Scenes with the same contents have the same reference.
-        studies[study] = references.setdefault(reference.path, reference)
+        place = Path(job["scene"]), job["parameters"]
+        studies[study] = _reference(args, *place, environment, references, used)
         stores |= {each.name: study.store for each in missing}
         jobs += missing
     for reference in references.values():
@@ -183,12 +234,9 @@ def _begin(
 ) -> tuple[ClusterOptions, Environment]:
     """Check the options of all runs, and set the variant."""
     options = ClusterOptions.of(args, most_workers)
-    if args.mode.startswith("llvm"):
-        require_llvm()
-    mi.set_variant(args.mode)
+    select_variant(args.mode)
     mi.set_log_level(mi.LogLevel.Warn)
-    for module in args.modules:
-        importlib.import_module(module)
+    import_modules(args.modules)
     return options, Environment.here(args.mode, args.modules, options.threads)
 
 
@@ -201,16 +249,27 @@ def _scene(args: argparse.Namespace) -> tuple[Path, dict[str, str], str | None]:
     return scene, parameters, integrator
 
 
-def _check_parent(file: Path) -> None:
+def _check_parent(file: Path, scene: Path) -> None:
+    """Raise IrrcacheError if a cache cannot be written to a file, which may be the ``scene``."""
     if not file.parent.is_dir():
         raise IrrcacheError(f'cannot write "{file}": the folder "{file.parent}" does not exist.')
     if file.is_dir():
         raise IrrcacheError(f'cannot write "{file}": it is a folder; name a file.')
+    if file.exists() and file.samefile(scene):
+        raise IrrcacheError(f'-o "{file}" is the scene itself; name another file for the cache.')
 
 
 def _reference(
-    args: argparse.Namespace, scene: Path, parameters: dict[str, str], environment: Environment
+    args: argparse.Namespace,
+    scene: Path,
+    parameters: dict[str, str],
+    environment: Environment,
+    known: dict[Path, ReferenceRun],
+    used: ExitStack,
 ) -> ReferenceRun:
+    """Return the reference of a scene, which is one of those ``known`` where the contents are the
+    same; ``used`` keeps other commands from its folder if there is anything to be computed.
+    """
     require_emission(scene, parameters, args.reference)
     arguments = scene_arguments(scene, parameters, args.reference)
     available = len(load_scene(scene, parameters, args.reference).sensors())
@@ -220,7 +279,17 @@ def _reference(
         )
     folder = (args.references or default_folder()).resolve()
     path = reference_path(scene, parameters, args.reference, args.sensor, folder)
-    return ReferenceRun(arguments, args.sensor, path, args.reference_spp, environment)
+    if path in known:
+        return known[path]
+    with ExitStack() as alone:
+        alone.enter_context(waiting_launches(path).alone(resume=True))
+        settings = args.sensor, path, args.reference_spp, environment
+        known[path] = ReferenceRun(arguments, *settings)
+        if known[path].missing:
+            used.push(alone.pop_all())
+        else:  # others may use it, too
+            known[path].finish()
+    return known[path]
 
 
 def _dispatch(options: ClusterOptions, jobs: Sequence[Job], store: Store) -> int:

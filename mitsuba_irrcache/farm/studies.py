@@ -6,6 +6,7 @@ import argparse
 import copy
 import tempfile
 from collections import Counter
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 
@@ -35,15 +36,19 @@ class SceneStudy:
         self._results = Results(self._folder)
         self._checked: dict = {}
 
+    def alone(self, resume: bool) -> AbstractContextManager[None]:
+        """Return a context for all that follows: no other command writes to the folder."""
+        return self._results.alone(resume)
+
     def begin(self, resume: bool) -> list[Job]:
         """Check scene and integrators; return the jobs of measurements that remain."""
         self._results.begin(resume)
-        for name in FOLDERS:
-            (self._folder / name).mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="irrcache-farm-") as scratch:
             wanted = self._job | {"integrators": [*self._args.integrator, self._args.reference]}
             files = Path(scratch) / "checked.json", Path(scratch) / "log"
             self._checked = run_job("check", wanted, *files)
+        for name in FOLDERS:
+            (self._folder / name).mkdir(exist_ok=True)
         good = {measurement.name for measurement in self.measurements if not measurement.error}
         return [job for job in self._jobs if job.arguments["name"] not in good]
 

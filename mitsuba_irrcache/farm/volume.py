@@ -32,6 +32,10 @@ from mitsuba_irrcache.out_of_core.slab_sweep import PairsOfOrdinates, Progress, 
 from mitsuba_irrcache.out_of_core.slabs import even_slabs
 from mitsuba_irrcache.out_of_core.survey import MappedField
 
+#: Digits of the name of a folder of working files, and the pattern of such names.
+DIGITS = 16
+NAMES = "[0-9a-f]" * DIGITS
+
 
 class FarmSweep(SlabSweep):
     """Sweeps by the workers of a ``connection``, with working files in a folder that all of them
@@ -53,8 +57,10 @@ class FarmSweep(SlabSweep):
         self._connection, self._environment = connection, environment
         settings = [inputs, PAIRS, FEWEST_SLABS, environment.variant, environment.software]
         # Nothing is read that workers of an earlier run, of other inputs, may still be writing.
-        own = folder.resolve() / hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16]
-        self._results = Results(own, "finished")
+        digest = hashlib.sha256(json.dumps(settings).encode()).hexdigest()
+        own = folder.resolve() / digest[:DIGITS]
+        # All files there are of runs, also where a command was killed while it removed them.
+        self._results = Results(own, "finished", names=["*"])
         folder.mkdir(exist_ok=True)
         self._results.begin(resume=True)
         super().__init__(sigma_t, own, _memory_of_first_run(own, memory))

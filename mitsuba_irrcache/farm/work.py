@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import tempfile
 import threading
@@ -19,7 +18,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.cli.render import described
 from mitsuba_irrcache.compare.command import measure_integrator
 from mitsuba_irrcache.compare.reference import render_halves
-from mitsuba_irrcache.errors import original_message
+from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.farm import volume_jobs
 from mitsuba_irrcache.farm.jobs import (
     Environment,
@@ -35,6 +34,8 @@ from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
 from mitsuba_irrcache.machine.doctor import available_cores
 from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.machine.modules import import_modules
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.stream_parts import StreamParts
 
 #: Held by the thread that works: a worker with several threads runs one job at a time, since Dr.Jit
@@ -93,8 +94,6 @@ def set_up(environment: Environment) -> None:
         if mi.variant() != environment.variant:
             mi.set_variant(environment.variant)
         mi.set_log_level(mi.LogLevel.Error)
-        for module in environment.modules:
-            importlib.import_module(module)
         # With a single thread Mitsuba waits for ever when it reads an EXR file.
         threads = max(2, environment.threads or available_cores())
         if dr.thread_count() != threads:
@@ -103,6 +102,10 @@ def set_up(environment: Environment) -> None:
     except Exception as error:
         message = original_message(error)
         raise UnfitWorkerError(f"{environment.variant} cannot be used: {message}") from error
+    try:
+        import_modules(environment.modules)
+    except IrrcacheError as error:
+        raise UnfitWorkerError(str(error).rstrip(".")) from error
     for module, wanted in environment.sources:
         if source_digest(module) != wanted:
             raise UnfitWorkerError(
@@ -113,11 +116,12 @@ def set_up(environment: Environment) -> None:
 
 def cache_part(arguments: dict, folder: Path) -> None:
     """Compute consecutive batches of the cache of one medium."""
-    key = json.dumps([arguments["scene"], arguments["medium"]], sort_keys=True)
+    number, batch = arguments["medium"], arguments["batch"]
+    key = json.dumps([arguments["scene"], number, batch], sort_keys=True)
 
     def opened() -> StreamParts:
         scene = _loaded(arguments["scene"])
-        return StreamParts(scene, scene.integrator().cached_media(scene)[arguments["medium"]])
+        return StreamParts(scene, scene.integrator().cached_media(scene)[number], batch)
 
     parts = _SCENES.get(key, opened)
     part = parts.compute(arguments["first"], arguments["count"])
@@ -150,8 +154,7 @@ def _prepare(scene: mi.Scene) -> None:
     The samples are the same as those that would be computed, so images do not depend on which
     worker renders which frame.
     """
-    integrator = scene.integrator()
-    media = [m for m in integrator.cached_media(scene) if not m.is_dark and not m.settings.file]
+    media = _with_caches_of_their_own(scene)
     for medium in media:
         medium.cache.fingerprint = medium.fingerprint(scene)
     settings = [
@@ -165,8 +168,15 @@ def _prepare(scene: mi.Scene) -> None:
     if key == _CACHES.key:
         for medium, known in zip(media, _CACHES.value, strict=True):
             medium.cache.append(known, 0)
-    integrator.prepare(scene)
-    _CACHES.key, _CACHES.value = key, [_bare(medium.cache) for medium in media]
+    scene.integrator().prepare(scene)
+    if media == _with_caches_of_their_own(scene):  # otherwise they were replaced by new ones
+        _CACHES.key, _CACHES.value = key, [_bare(medium.cache) for medium in media]
+
+
+def _with_caches_of_their_own(scene: mi.Scene) -> list[CachedMedium]:
+    """Return the media of a scene whose caches are neither zero nor in files."""
+    media = scene.integrator().cached_media(scene)
+    return [medium for medium in media if not medium.is_dark and not medium.settings.file]
 
 
 def _bare(cache: IrradianceCache) -> IrradianceCache:

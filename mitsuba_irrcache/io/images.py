@@ -30,6 +30,28 @@ def check_output(path: str | Path) -> Path:
     return path
 
 
+def further_channels(count: int, names: Sequence[str]) -> list[str]:
+    """Return the names of the channels of an image after its luminance or RGB, and alpha.
+
+    ``names`` are those of an integrator, ``aov_names()``. Mitsuba's ``aov`` names R, G, B and A of
+    each integrator in it, of which the image has the channels of the film, and first of all those
+    of the first integrator. Raises IrrcacheError if the ``count`` channels have other names.
+    """
+    endings = [name.rpartition(".")[2] for name in names]
+    nested = [i for i in range(len(names)) if endings[i : i + 4] == ["R", "G", "B", "A"]]
+    if nested and count <= len(names):
+        shown = (count - len(names)) // len(nested) + 4  # channels of the film
+        left_out = {i + k for i in nested for k in range(shown, 4)}
+        left_out |= {nested[0] + k for k in range(shown)}
+        names = [name for i, name in enumerate(names) if i not in left_out]
+    if count - len(names) not in CHANNELS:
+        raise IrrcacheError(
+            f"the integrator has {count} channels, but names {len(names)} beside those of the "
+            f"image ({', '.join(names)}); leave some of its aovs out."
+        )
+    return list(names)
+
+
 def write_image(
     path: str | Path,
     image: np.ndarray,
@@ -39,13 +61,14 @@ def write_image(
 ) -> Path:
     """Write ``image`` (height, width, channel), linear radiance, to an EXR and an sRGB PNG.
 
-    The channels are luminance or RGB, optionally alpha, followed by those named in ``further``,
-    which are stored in the EXR only. ``metadata`` is stored in its header with the prefix
-    ``irrcache:``; ``display`` affects the PNG only. Returns the path of the PNG.
+    The channels are luminance or RGB, optionally alpha, followed by those named in ``further`` (see
+    `further_channels`), which are stored in the EXR only. ``metadata`` is stored in its header with
+    the prefix ``irrcache:``; ``display`` affects the PNG only. Returns the path of the PNG.
     """
     path = check_output(path)
     image = np.ascontiguousarray(image, dtype=np.float32)
     buffer = oiio.ImageBuf(image)
+    further = further_channels(image.shape[2], further) if further else ()
     shown = image.shape[2] - len(further)
     if further:
         buffer.specmod().channelnames = (*CHANNELS[shown], *further)

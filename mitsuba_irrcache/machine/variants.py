@@ -2,9 +2,31 @@
 
 from __future__ import annotations
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, original_message
+from mitsuba_irrcache.machine.llvm import require_llvm
 
 SUPPORTED = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
+
+
+def select_variant(variant: str) -> None:
+    """Select the variant of a command; raise IrrcacheError if it cannot be used on this machine."""
+    import mitsuba as mi  # imported here because `irrcache doctor` does without
+
+    if variant.startswith("llvm"):
+        require_llvm()
+    if variant not in mi.variants():
+        raise IrrcacheError(
+            f'Mitsuba has no variant "{variant}" (-m); it has {", ".join(mi.variants())}.'
+        )
+    try:
+        mi.set_variant(variant)
+    except ImportError as error:  # as without a GPU
+        needed = "an NVIDIA GPU and its driver are needed" if "cuda" in variant else "see why"
+        raise IrrcacheError(
+            f'-m is "{variant}", which cannot be used on this machine '
+            f"({original_message(error).rstrip('.')}): {needed} (irrcache doctor); or name another "
+            f"variant, such as {SUPPORTED[0]}."
+        ) from error
 
 
 def require_variant(variant: str) -> None:

@@ -90,7 +90,7 @@ class MappedMedium:
         """
         version = SceneVersion(scene, None, self._version)
         paths = [path for path in (self._files.sigma_t, self._files.albedo) if path]
-        states = [VolumeFile(path).state for path in paths]
+        states = [VolumeFile(path).opened_state for path in paths]
         changed = states != self._states or version.changes(self._version)
         if self._rays is None or changed:
             self._rays = None
@@ -168,6 +168,8 @@ class MappedMedium:
             scattering.solve(scene, description, replace(self._settings, samples=0))
             found = add(found, scattering.find(report), sweep.file("both", channels=found.channels))
         sweep.close()
+        for field in mapped:
+            field.file.require_unchanged()
         self._irradiance = found, colour
         if files.irradiance:
             write(Path(files.irradiance), found, colour, inputs)

@@ -150,6 +150,8 @@ class ScatteredIrradiance:
             source = irradiance * self._albedo(*box) * np.float32(1 / (4 * np.pi))
             source = self._antidiffused(source, self._sweep.extinction(*box))
             file.write(lower, source[lower[0] - first : upper[0] - first])
+        if isinstance(self._medium.albedo, MappedField):
+            self._medium.albedo.file.require_unchanged()  # before anything is computed from it
         return file
 
     def _antidiffused(self, source: np.ndarray, sigma_t: np.ndarray) -> np.ndarray:

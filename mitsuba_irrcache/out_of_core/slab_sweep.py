@@ -155,6 +155,7 @@ def write_levels(file: BrickFile, sigma_t: MappedField, top: float, memory: int)
         levels = quantised(sigma_t.values(first, last), top, first * slice_voxels)
         values = np.array(levels).astype(np.uint16)
         file.write((first, 0, 0), values.reshape(last - first, *sides))
+    sigma_t.file.require_unchanged()  # before anything is computed from it
 
 
 #: What the tracks of each pair carry, by its number: for either way the radiance in each channel

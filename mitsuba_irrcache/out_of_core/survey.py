@@ -63,6 +63,7 @@ class MappedField:
             found.append([_windows(end, size, np_reduce) for end, np_reduce in zip(
                 ends, (np.minimum, np.maximum), strict=True
             )])  # fmt: skip
+        self.file.require_unchanged()
         least, largest = (np.stack(bounds) for bounds in zip(*found, strict=True))
         return least, largest, sha.hexdigest()
 

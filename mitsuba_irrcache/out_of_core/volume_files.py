@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from mitsuba_irrcache.machine.extras import require
 #: Names of raw files, with sizes along x, y, z and type, as in the Open SciVis data sets.
 RAW_NAME = re.compile(r"_(\d+)x(\d+)x(\d+)_(u?int(?:8|16|32)|float(?:16|32|64))\.raw$")
 
+#: Largest share of the time that is spent on finding changes of a file while it is read.
+SHARE_OF_CHECKS = 0.05
+
 
 class VolumeFile:
     """A volume (z, y, x) in a file, of which some slices at a time are in memory.
@@ -23,13 +27,17 @@ class VolumeFile:
     endian, x fastest) such as ``head_256x256x113_uint16.raw``.
 
     Raises:
-        IrrcacheError: a file that is none of these, is truncated, or holds no real numbers.
+        IrrcacheError: a file that is none of these, is truncated, or holds no real numbers; or one
+            that another program has written to since it was opened, when it is read.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         if not self.path.exists():
             raise IrrcacheError(f'irrcache: the volume file "{self.path}" does not exist.')
+        #: `state` when it was opened
+        self.opened_state = self.state
+        self._next_check = 0.0
         self._open = self._opener()
         array = self._open()
         if len(array.shape) != 3 or min(array.shape) < 2:
@@ -50,14 +58,37 @@ class VolumeFile:
         """Return the slices ``first`` to ``last - 1``, float32 (z, y, x)."""
         # Opened anew each time: pages of a mapped file count as memory of the process while it is
         # mapped.
-        array = self._open()
         try:
-            return np.ascontiguousarray(array[first:last], dtype=np.float32)
+            array = self._open()
+            # A copy also where the type is the same: a view would be read after the check below.
+            values = np.array(array[first:last], dtype=np.float32, order="C")
+        except IrrcacheError:
+            raise
         except Exception as error:  # the decoders of Zarr raise exceptions of any type
             raise IrrcacheError(
                 f'irrcache: slices {first} to {last - 1} of "{self.path}" cannot be read '
                 f"({reason(error)}); copy or write it again."
             ) from error
+        # A folder of many files is looked through for a small share of the time.
+        if perf_counter() >= self._next_check:
+            self.require_unchanged()
+        return values
+
+    def require_unchanged(self) -> None:
+        """Raise IrrcacheError if the file was written to since it was opened: what was read is then
+        a mixture of two volumes.
+        """
+        started = perf_counter()
+        try:
+            is_unchanged = self.state == self.opened_state
+        except FileNotFoundError:  # being replaced
+            is_unchanged = False
+        if not is_unchanged:
+            raise IrrcacheError(
+                f'irrcache: the volume file "{self.path}" was changed while it was in use; when it '
+                "is complete, start again."
+            )
+        self._next_check = started + (perf_counter() - started) / SHARE_OF_CHECKS
 
     @property
     def state(self) -> list[tuple[str, int, int, int]]:

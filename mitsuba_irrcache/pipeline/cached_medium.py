@@ -528,7 +528,10 @@ class CachedMedium:
             return False
         fingerprint, samples = IrradianceCache.description_of(file)
         if differing(fingerprint, self.cache.fingerprint):
-            raise CacheFileError(f'"{file}" has been replaced by the cache of another scene')
+            raise CacheFileError(
+                f'"{file}" has been replaced by the cache of another scene; give each scene a file '
+                "of its own"
+            )
         return samples >= self.cache.samples
 
 

@@ -20,15 +20,15 @@ class _Collector(IrradianceCache):
     collects the batches that the solver adds in another cache, ``found``.
     """
 
-    def __init__(self, like: IrradianceCache, fingerprint: dict[str, str]) -> None:
-        """Take the voxels and settings of another cache."""
+    def __init__(self, like: IrradianceCache, fingerprint: dict[str, str], batch: int) -> None:
+        """Take the voxels and settings of another cache, but its own ``batch``."""
         super().__init__(
             like.grid,
             like.active,
             like.channels,
             like.max_depth,
             fingerprint,
-            like.batch,
+            batch,
             like.correlated,
             like.moments,
             like.interpolation,
@@ -61,12 +61,15 @@ def missing_parts(cached: CachedMedium) -> Iterator[tuple[int, int]]:
 class StreamParts:
     """Computes parts of the random stream of the cache of one medium, in any order.
 
-    The cache of ``cached`` is not changed. One solver, with its tables, serves all parts.
+    The cache of ``cached`` is not changed. One solver, with its tables, serves all parts. ``batch``
+    is that of the cache to which they are appended, which has it from its file if this was begun
+    with other settings; 0: that of the cache of ``cached``.
     """
 
-    def __init__(self, scene: mi.Scene, cached: CachedMedium) -> None:
+    def __init__(self, scene: mi.Scene, cached: CachedMedium, batch: int = 0) -> None:
         self._seed = cached.settings.seed
-        self._collector = _Collector(cached.cache, cached.fingerprint(scene))
+        cache = cached.cache
+        self._collector = _Collector(cache, cached.fingerprint(scene), batch or cache.batch)
         self._solver = cached.new_solver(scene, self._collector)
 
     def compute(self, first: int, count: int) -> IrradianceCache:

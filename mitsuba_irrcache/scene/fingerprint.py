@@ -44,6 +44,9 @@ class SceneVersion:
     ones. Code that edits a large array through a view has to call ``params.set_dirty``, which
     Mitsuba requires as well.
 
+    Reading a literal, a constant without memory, as a NumPy array gives it memory and another
+    index: what has the same contents is no edit.
+
     A version keeps the old arrays of an edited scene alive until the next rendering, which
     releases them before it creates the new cache.
     """
@@ -90,6 +93,15 @@ class SceneVersion:
         return not self._objects.isdisjoint(other._objects)
 
 
+def values_of(value: Any) -> np.ndarray:
+    """Return a Dr.Jit array, or anything else, as a NumPy array; it stays as it is.
+
+    NumPy evaluates what it reads, so that a literal of a scene would get memory and another index,
+    and the kernels that use it another text: a copy is read, which shares all other memory.
+    """
+    return np.array(dr.detach(value) if dr.is_array_v(value) else value)
+
+
 def _value(entry: tuple) -> Any:
     """Return the value of a traversed parameter; None if the plugin has none."""
     value, kind, node, _ = entry
@@ -120,9 +132,10 @@ class _Kept:
         self.index, self._kind, self._width = array.index, type(array), dr.width(array)
         self._view = self._bytes = None
         self._whole = False
-        if array.state == dr.VarState.Literal:
-            return  # no memory that could be written to
         size = dr.itemsize_v(array) * self._width
+        if array.state == dr.VarState.Literal:  # no memory that could be written to
+            self._whole = size <= SMALL
+            return
         self._whole = size <= min(SMALL, budget.left)
         budget.left -= size if self._whole else 0
         if dr.backend_v(array) == dr.JitBackend.LLVM:
@@ -144,6 +157,11 @@ class _Kept:
         return dr.gather(self._kind, self._array, place).numpy().tobytes()
 
     @property
+    def _contents(self) -> bytes:
+        """The values when this was made; those of a literal are read when they are asked for."""
+        return values_of(self._array).tobytes() if self._bytes is None else self._bytes
+
+    @property
     def is_intact(self) -> bool:
         """Whether the memory of the array is unchanged, as far as it is compared."""
         return self._bytes is None or self._read() == self._bytes
@@ -151,9 +169,11 @@ class _Kept:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, _Kept) or self._kind is not other._kind:
             return False
-        if self._width != other._width or self._bytes != other._bytes:
+        if self._width != other._width:
             return False
-        return self.index == other.index or (self._whole and other._whole)
+        if self.index == other.index:
+            return self._bytes == other._bytes
+        return self._whole and other._whole and self._contents == other._contents
 
     __hash__ = None
 
@@ -181,7 +201,7 @@ def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
         return value
     if _is_transform(value):
         return _kept(value.matrix, previous, budget)
-    array = np.array(value)
+    array = values_of(value)
     return repr(value) if array.dtype == object else (array.dtype.str, array.tobytes())
 
 
@@ -326,7 +346,7 @@ def _object_digest(node: mi.Object, without: tuple[str, ...] = ()) -> str:
     those ``without`` these prefixes, and of ``str(node)``, which names nested objects and options.
     """
     values = [
-        (key, np.array(_plain(value)))
+        (key, values_of(_plain(value)))
         for key, entry in sorted(mi.traverse(node).properties.items())
         if not key.startswith(without or "\0") and (value := _value(entry)) is not None
     ]
@@ -336,13 +356,13 @@ def _object_digest(node: mi.Object, without: tuple[str, ...] = ()) -> str:
 
 def _field_parts(field: Field) -> tuple:
     if field.grid is None:
-        return (np.array(field.value),)
+        return (values_of(field.value),)
     return (
         field.grid.shape,
         np.float32(field.grid.to_world),
-        np.array(field.scale),
+        values_of(field.scale),
         field.channels,
-        np.array(field.data),
+        values_of(field.data),
     )
 
 

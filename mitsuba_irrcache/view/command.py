@@ -22,6 +22,7 @@ from mitsuba_irrcache.io.scene_files import integrator_of, parse_parameters
 from mitsuba_irrcache.machine.extras import require
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.memory import free_at_once
+from mitsuba_irrcache.machine.variants import select_variant
 from mitsuba_irrcache.volumes import importer
 from mitsuba_irrcache.volumes.options import MissingItemError, UnchosenItemError
 
@@ -112,7 +113,7 @@ def _fill(server: Server, args: argparse.Namespace, name: str) -> Session:
     from mitsuba_irrcache.view.session import Session
 
     server.show_message(f"reading {name} ...")
-    mi.set_variant(args.mode)
+    select_variant(args.mode)
     mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
     free_at_once()
     document, appearance = _document(args, server)

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import socket
+import threading
+from contextlib import suppress
+from dataclasses import replace
 from importlib import metadata
 
 import pytest
+from distributed import LocalCluster
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm import cluster
@@ -70,6 +75,50 @@ def test_a_scheduler_that_does_not_answer(monkeypatch):
         connected(options("--scheduler", "missing.json")),
     ):
         pytest.fail("it is connected to nothing")
+
+
+@pytest.mark.parametrize("answer", [b"", b"HTTP/1.0 400 Bad Request\r\n\r\n", b"\0" * 64])
+def test_another_program_that_answers_is_no_scheduler(monkeypatch, answer):
+    """As a web server, which may wait for more, or say what Dask does not understand."""
+    monkeypatch.setattr(cluster, "PATIENCE", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def reply() -> None:
+            with suppress(OSError):  # closed
+                while True:
+                    held.append(server.accept()[0])
+                    held[-1].sendall(answer)
+
+        held: list[socket.socket] = []
+        threading.Thread(target=reply, daemon=True).start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with (
+            pytest.raises(IrrcacheError, match=rf'no scheduler answers at "{address}" \(\w.*dask'),
+            connected(options("--scheduler", address)),
+        ):
+            pytest.fail("it is connected to nothing")
+        server.shutdown(socket.SHUT_RDWR)
+        for each in held:
+            each.close()
+
+
+@pytest.mark.parametrize("address", ["ucx://127.0.0.1:1", "no_such://host:1", " "])
+def test_an_address_of_no_scheduler_is_named(monkeypatch, address):
+    monkeypatch.setattr(cluster, "PATIENCE", 0.2)
+    given = replace(options("--scheduler", "tcp://host:1"), scheduler=address)
+    with (
+        pytest.raises(IrrcacheError, match=rf'no scheduler answers at "{address}" \(\w'),
+        connected(given),
+    ):
+        pytest.fail("it is connected to nothing")
+
+
+def test_a_scheduler_that_answers_is_used():
+    place = {"host": "127.0.0.1", "protocol": "tcp", "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(n_workers=0, processes=False, **place) as running:
+        address = running.scheduler_address
+        with connected(options("--scheduler", address)) as connection:
+            assert connection.client.scheduler.address == address
 
 
 @pytest.mark.parametrize("content", ["", "[1]", "null", '{"a": 1}', '{"address": 5}', "\xff"])

@@ -85,6 +85,8 @@ def test_a_table_of_a_spreadsheet(tmp_path):
 
 def test_sensors():
     assert sensors_of("all", 3) == [0, 1, 2] and sensors_of("2,0", 3) == [2, 0]
-    for text in ("3", "-1", "a", "0,0", ""):
+    for text in ("3", "-1", "a", ""):
         with pytest.raises(IrrcacheError, match="the scene has 3 sensor"):
             sensors_of(text, 3)
+    with pytest.raises(IrrcacheError, match='is "2,0,1,0,2", which names 0, 2 more than once'):
+        sensors_of("2,0,1,0,2", 3)

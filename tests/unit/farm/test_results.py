@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -73,6 +74,83 @@ def test_other_folders_are_refused(tmp_path):
     ):
         with pytest.raises(IrrcacheError, match=said):
             Results(folder).begin(resume=True)
+
+
+def test_a_folder_is_used_by_one_command_at_a_time(tmp_path):
+    """Another one is refused until the first has ended, and nothing empty is left of either."""
+    folder = tmp_path / "results"
+    with Results(folder).alone(resume=False):
+        with pytest.raises(IrrcacheError, match=r'another command is using ".*results"; when'):
+            with Results(folder).alone(resume=True):
+                pass
+    assert not folder.exists()
+    folder.mkdir()
+    with pytest.raises(KeyError), Results(folder).alone(resume=False):
+        raise KeyError
+    assert folder.is_dir() and not any(folder.iterdir())  # was there before
+    with Results(folder).alone(resume=False):
+        Results(folder).store(job(1), outcome(1))
+    assert [path.name for path in (folder / ".farm").iterdir()] == ["job-1.json"]
+    with pytest.raises(IrrcacheError, match="add --resume"), Results(folder).alone(resume=False):
+        pass
+    # A killed command leaves the file that it had locked.
+    (folder / ".farm" / "lock").touch()
+    with Results(folder).alone(resume=True):
+        pass
+
+
+def test_the_next_command_does_not_lose_its_lock(tmp_path):
+    """The first one removes the folder, and the next one begins before the first has ended."""
+    folder = tmp_path / "results"
+    first, second, third = (Results(folder, names=["*.part"]) for _ in range(3))
+    with first.alone(resume=True):
+        first.store(job(1), outcome(1))
+        first.remove_all()
+        assert not folder.exists()
+        context = second.alone(resume=True)
+        context.__enter__()
+    with pytest.raises(IrrcacheError, match="another command"), third.alone(resume=True):
+        pass
+    context.__exit__(None, None, None)
+    assert not folder.exists()
+
+
+def test_only_files_of_runs_are_removed(tmp_path):
+    folder = tmp_path / "results"
+    results = Results(folder, names=["[0-9].part", "[a-f]"])
+    results.begin(resume=True)
+    results.store(job(1), outcome(1))
+    (folder / ".1.part.x8s.tmp").touch()
+    (folder / "a").mkdir()
+    (folder / "a" / "working").touch()
+    for name in ("mine.txt", "my.part"):
+        (folder / name).write_text("precious")
+    results.remove_all()
+    assert sorted(path.name for path in folder.iterdir()) == ["mine.txt", "my.part"]
+    with pytest.raises(IrrcacheError, match=r'but "mine\.txt"'):
+        results.begin(resume=True)
+
+
+def test_what_is_left_without_records_is_continued(tmp_path):
+    """As where a command is killed while it removes them."""
+    folder = tmp_path / "results"
+    folder.mkdir()
+    (folder / "1.part").write_text("of an unknown job")
+    results = Results(folder, names=["[0-9].part"])
+    results.begin(resume=True)
+    assert not results.has(job(1))
+    results.store(job(1), outcome(1))
+    assert results.has(job(1))
+    results.remove_all()
+    assert not folder.exists()
+
+
+def test_a_folder_that_another_command_removes_is_named(results):
+    """Nothing is written to it: files without records would be refused by the next command."""
+    shutil.rmtree(results.folder)
+    with pytest.raises(IrrcacheError, match=r"results.* was removed .*as by another command"):
+        results.store(job(1), outcome(1))
+    assert not results.folder.exists()
 
 
 def test_parts_are_added_in_their_order_and_once(results):

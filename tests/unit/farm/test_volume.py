@@ -5,6 +5,7 @@ in whatever order, and however often, jobs are run.
 from __future__ import annotations
 
 import re
+import shutil
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
@@ -191,6 +192,19 @@ def test_finished_jobs_of_other_inputs_are_not_used(sigma_t, tmp_path, monkeypat
     assert not again.runs
     both_sweeps(farm_sweep(sigma_t, tmp_path, inputs="b"), 4, 1)
     assert again.runs
+
+
+def test_working_files_without_records_are_computed_again(sigma_t, tmp_path, monkeypatch):
+    """As where a command is killed while it removes them."""
+    Workers(monkeypatch, 1)
+    expected = both_sweeps(farm_sweep(sigma_t, tmp_path), 4, 1)
+    (records,) = tmp_path.glob("parts/*/finished")
+    shutil.rmtree(records)
+    again = Workers(monkeypatch, 1)
+    found = both_sweeps(farm_sweep(sigma_t, tmp_path), 4, 1)
+    assert again.runs
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
 
 
 def test_a_run_with_other_memory_continues_with_the_same_slabs(sigma_t, tmp_path, monkeypatch):

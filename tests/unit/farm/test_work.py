@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import hashlib
 import importlib
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
 import pytest
 from mitsuba_irrcache.scenes import scene_path
 
@@ -26,6 +28,7 @@ from mitsuba_irrcache.farm.studies import SceneStudy, arguments_by_scene
 from mitsuba_irrcache.farm.work import KINDS, UnfitWorkerError, set_up
 from mitsuba_irrcache.io.images import read_image, write_image
 from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -96,7 +99,10 @@ def outcome(job: Job, folder: Path) -> Outcome:
     [
         ({"software": (("mitsuba_irrcache", "0.0.1"),)}, "it has mitsuba_irrcache .*, not 0.0.1"),
         ({"variant": "cuda_no_such"}, "cuda_no_such cannot be used"),
-        ({"modules": ("no_such_module",)}, "no_such_module"),
+        (
+            {"modules": ("no_such_module",)},
+            r'^--import no_such_module: there is no module "no_such_module"; .*PYTHONPATH$',
+        ),
     ],
     ids=str,
 )
@@ -207,6 +213,63 @@ def test_frames_that_need_no_cache_are_rendered_without_one(environment, tmp_pat
     assert scene.integrator().cache.samples == 0
     # Mitsuba's film adds in no fixed order.
     np.testing.assert_allclose(read_image(tmp_path / "found.exr"), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("is_edited", [False, True])
+def test_frames_under_an_environment_map(scene, environment, tmp_path, monkeypatch, is_edited):
+    """Also where the integrator replaces its caches after their fingerprints were computed."""
+    sky = scene.with_name("sky.exr")
+    mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(sky))
+    named = f'<emitter type="envmap"><string name="filename" value="{sky}"/>'
+    text = scene.read_text().replace('<emitter type="constant">', named)
+    assert named in text
+    scene.write_text(re.sub('<rgb name="radiance".*?/>', "", text))
+    integrator = "irrcache{solver=path,resolution=4,cache_spp=16}"
+    job = frame_job(scene, integrator, environment, SMALL)
+    expected = np.array(mi.render(load_scene(scene, SMALL, integrator), spp=1, seed=0))
+    if is_edited:
+        fingerprint = CachedMedium.fingerprint
+
+        def and_edit(medium, scene):
+            params = mi.traverse(scene)
+            (key,) = (key for key in params.keys() if key.endswith(".irradiance.value"))
+            params[key] = params[key] * 2
+            params.update()
+            return fingerprint(medium, scene)
+
+        monkeypatch.setattr(CachedMedium, "fingerprint", and_edit)
+    for name in ("first", "second"):
+        found = outcome(job, tmp_path / name)
+        (tmp_path / "found.exr").write_bytes(found.files["frame.exr"])
+        if not is_edited:
+            np.testing.assert_array_equal(read_image(tmp_path / "found.exr"), expected)
+
+
+@pytest.mark.parametrize("pixels", ["rgb", "rgba", "luminance"])
+@pytest.mark.parametrize("nested", [1, 2])
+def test_frames_have_the_channels_of_integrators_in_others(
+    scene, environment, tmp_path, pixels, nested
+):
+    """Mitsuba's ``aov`` names more channels than its image has."""
+    own = '<integrator type="$integrator">\n        <integer name="max_depth" value="$max_depth"/>'
+    aov = '<integrator type="aov"> <string name="aovs" value="dd:depth,nn:sh_normal"/>'
+    text = scene.read_text()
+    begin = text.index(own)
+    end = text.index("</integrator>") + len("</integrator>")
+    inner = text[begin:end] + "".join(['<integrator type="direct"/>'] * (nested - 1))
+    text = f"{text[:begin]}{aov}{inner}</integrator>{text[end:]}"
+    film = '<film type="hdrfilm">'
+    assert film in text
+    text = text.replace(film, f'{film} <string name="pixel_format" value="{pixels}"/>')
+    scene.write_text(text)
+    job = frame_job(scene, None, environment, SMALL | {"integrator": "volpath"})
+    found = outcome(job, tmp_path / "found")
+    (tmp_path / "found.exr").write_bytes(found.files["frame.exr"])
+    shown = {"rgb": "RGB", "rgba": "RGBA", "luminance": "Y"}[pixels]
+    channels = oiio.ImageBuf(str(tmp_path / "found.exr")).spec().channelnames
+    assert "".join(sorted(channels[: len(shown)])) == "".join(sorted(shown))
+    assert {name.rpartition(".")[2] for name in channels[-4:]} == {"T", "X", "Y", "Z"}
+    assert len(channels) == nested * len(shown) + 4
 
 
 def test_a_worker_that_sees_other_files_says_so(scene, tmp_path):

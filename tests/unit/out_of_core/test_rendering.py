@@ -81,6 +81,83 @@ def test_the_irradiance_is_written_to_a_file(density, tmp_path):
     np.testing.assert_allclose(np.load(file), expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["density.npy", "albedo.npy"])
+@pytest.mark.parametrize("when", ["uncollided", "scattered"])
+def test_no_irradiance_is_a_mixture_of_two_volumes(density, tmp_path, monkeypatch, name, when):
+    """Where a file is written to while the irradiance is computed, nothing comes of it."""
+    np.save(tmp_path / "albedo.npy", texture(SHAPE, 0.3, 1.0, 4))
+    file = tmp_path / "irradiance.npy"
+    files = {"albedo_file": str(tmp_path / "albedo.npy"), "irradiance_file": str(file)}
+    scene = scene_of(
+        tmp_path, medium(2.0, 0.9, PLACE), files=files | {"max_depth": -1}, emitter=SUN
+    )
+    compute = getattr(slab_sweep.SlabSweep, when)
+
+    def and_change(*arguments):
+        found = compute(*arguments)
+        np.save(tmp_path / name, np.load(tmp_path / name)[::-1])
+        return found
+
+    with monkeypatch.context() as changing:
+        changing.setattr(slab_sweep.SlabSweep, when, and_change)
+        with pytest.raises(RuntimeError, match=f"{name}.* was changed while it was in use"):
+            image(scene, spp=1)
+    assert not file.exists()
+    expected = image(scene_of(tmp_path, medium(2.0, 0.9, PLACE), files=files | {
+        "max_depth": -1, "irradiance_file": "",
+    }, emitter=SUN), spp=1)  # fmt: skip
+    np.testing.assert_array_equal(image(scene, spp=1), expected)
+
+
+def test_no_image_is_a_mixture_of_two_volumes(density, tmp_path, monkeypatch):
+    scene = scene_of(tmp_path, medium(2.0, 0.9, PLACE), sensor=from_the_side())
+    scene.integrator().prepare(scene)
+    enter = slab_march._SlabLookups.enter
+
+    def and_change(lookups, slab) -> None:
+        enter(lookups, slab)
+        np.save(tmp_path / "density.npy", density[::-1])
+
+    with monkeypatch.context() as changing:
+        changing.setattr(slab_march._SlabLookups, "enter", and_change)
+        with pytest.raises(RuntimeError, match=r"density\.npy.* was changed while it was in use"):
+            image(scene, spp=1)
+    again = scene_of(tmp_path, medium(2.0, 0.9, PLACE), sensor=from_the_side())
+    np.testing.assert_array_equal(image(scene, spp=1), image(again, spp=1))
+
+
+@pytest.mark.parametrize("kind", [".npy", "_4x3x2_uint8.raw", ".zarr"])
+@pytest.mark.parametrize("change", ["written", "replaced", "removed"])
+def test_a_changed_file_is_not_read_on(tmp_path, kind, change):
+    path, dtype = tmp_path / f"volume{kind}", np.uint8 if kind.endswith("raw") else np.float32
+
+    def write(where: Path) -> None:
+        if kind == ".zarr":
+            zarr = pytest.importorskip("zarr")
+            zarr.open(str(where), mode="w", shape=(2, 3, 4), chunks=(1, 3, 4), dtype="f4")[:] = 1
+        elif kind == ".npy":
+            np.save(where, np.ones((2, 3, 4), dtype))
+        else:
+            np.ones((2, 3, 4), dtype).tofile(where)
+
+    write(path)
+    file = VolumeFile(path)
+    values = file.read(0, 2)
+    assert values.flags.owndata and (values == 1).all()  # what is read later, is not read here
+    file.require_unchanged()
+    if change == "written":
+        write(path)
+    else:
+        path.rename(tmp_path / "before")
+        if change == "replaced":
+            write(path)
+    with pytest.raises(IrrcacheError, match="was changed while it was in use; when it is complete"):
+        file.require_unchanged()
+    with pytest.raises(IrrcacheError, match=r"was changed|cannot be|no complete"):
+        file._next_check = 0.0
+        file.read(0, 2)
+
+
 @pytest.mark.parametrize("name", ["density.npy", "other.npy", "notes.npy"])
 def test_files_that_are_no_irradiance_are_not_replaced(density, tmp_path, name):
     """The volume itself, another array, or a file of another kind."""

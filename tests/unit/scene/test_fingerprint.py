@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -72,6 +75,80 @@ def test_comparing_snapshots_runs_no_kernel(scenes, kernels):
     scene = cloud_scene(scenes)
     before = SceneVersion(scene)
     assert kernels(lambda: SceneVersion(scene).changes(before)) == []
+
+
+def bitmap() -> dict:
+    pixels = mi.TensorXf(np.full((4, 4, 3), 0.5, np.float32))
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+
+
+def above() -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f().look_at([0, 4, 0.1], [0, 0, 0], [0, 0, 1])
+
+
+#: Emitters of each kind; functions, since they are made in the variant of the test.
+EMITTERS: dict[str, Callable[[], dict]] = {
+    "constant": lambda: {"type": "constant", "radiance": 0.5},
+    "envmap": lambda: {"type": "envmap", "bitmap": bitmap()["bitmap"], "scale": 2.0},
+    "sunsky": lambda: {"type": "sunsky"},
+    "directional": lambda: {"type": "directional", "direction": [0, -1, 0.2]},
+    "point": lambda: {"type": "point", "position": [0, 4, 0]},
+    "spot": lambda: {"type": "spot", "texture": bitmap(), "to_world": above()},
+    "projector": lambda: {"type": "projector", "irradiance": bitmap(), "to_world": above()},
+    "area": lambda: {
+        "type": "sphere", "center": [0, 4, 0], "radius": 0.5,
+        "emitter": {"type": "area", "radiance": bitmap()},
+    },
+}  # fmt: skip
+
+
+def literals(scene: mi.Scene) -> list[str]:
+    """Return the names of the parameters that are constants without memory."""
+    return [
+        key
+        for key, value in mi.traverse(scene)
+        if dr.is_jit_v(value)
+        and dr.depth_v(value) == 1
+        and not dr.is_tensor_v(value)
+        and value.state == dr.VarState.Literal
+    ]
+
+
+@pytest.mark.parametrize("kind", EMITTERS)
+def test_computing_digests_is_no_edit(scenes, kind):
+    scene = cloud_scene(scenes, emitter=EMITTERS[kind]())
+    before, constants = SceneVersion(scene), literals(scene)
+    digest(scene)
+    assert SceneVersion(scene).changes(before) == [] and literals(scene) == constants
+
+
+@pytest.mark.parametrize("kind", EMITTERS)
+def test_a_second_image_needs_no_new_cache(scenes, refine_calls, kind):
+    """Nor is one needed after the fingerprint was computed, and all parameters were read."""
+    integrator = {"type": "irrcache", "resolution": 4, "cache_spp": 32, "max_depth": 2}
+    scene = scenes.load(
+        integrator, scenes.boundary(scenes.medium(2.0, 0.8)), 4, "path", emitter=EMITTERS[kind]()
+    )
+    (medium,) = scene.integrator().cached_media(scene)
+    medium.fingerprint(scene)
+    for _ in range(2):
+        scenes.image(scene, spp=1)
+        assert scene.integrator().cached_media(scene) == [medium] and len(refine_calls) == 1
+        for key, value in mi.traverse(scene):
+            if dr.is_array_v(value) and "vertex" not in key:
+                np.array(value)
+
+
+def test_a_parameter_that_is_read_is_not_edited(scenes):
+    scene = cloud_scene(scenes, emitter=EMITTERS["envmap"]())
+    before = SceneVersion(scene)
+    params, key = named(scene, "emitter.scale")
+    np.array(params[key])
+    assert params[key].state != dr.VarState.Literal
+    assert SceneVersion(scene).changes(before) == []
+    params[key] = mi.Float(3)
+    params.update()
+    assert SceneVersion(scene).changes(before) == [key]
 
 
 def digest(scene) -> dict[str, str]:
