@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 
 import mitsuba as mi
 import numpy as np
@@ -191,4 +192,4 @@ def test_references_without_the_emission_of_media_are_refused(scene, tmp_path):
         reference(scene, {}, "volpath", folder, spp=1)
     farm = argparse.Namespace(reference="volpath", sensor=0, references=folder, reference_spp=4)
     with pytest.raises(IrrcacheError, match="would be without emission"):
-        runs._reference(farm, scene, {}, None)
+        runs._reference(farm, scene, {}, None, {}, ExitStack())
