@@ -40,6 +40,7 @@ from mitsuba_irrcache.scene.consistency import (
     check_media_agree,
     check_sensor,
     described,
+    warn_of_missing_medium,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.transport.path import (
@@ -99,6 +100,7 @@ def compile_scene(
     _warn_of_lost_bounds(scene)
     for sensor in scene.sensors():
         check_sensor(scene, sensor)
+        warn_of_missing_medium(scene, sensor)
     has_surfaces = _has_surfaces(scene)
     boundary = _boundary_without_surfaces(scene, media)
     is_isolated = boundary is not None

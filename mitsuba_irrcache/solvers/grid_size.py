@@ -89,6 +89,8 @@ NOTABLE_UNRESOLVED = 0.8
 #: to a luminous surface images are too dark, by an error that falls with the edge of a voxel. The
 #: mean of a foggy room is off by -0.55 % with 32 voxels and -0.17 % with 48 (1.2 times the time).
 FINER_AROUND_EMITTERS = 1.5
+#: Largest ratio of the voxels along a side of a long medium with surfaces to those of a cube.
+MOST_ELONGATED = 4.0
 #: Error [%] of images of surfaces in a homogeneous medium, at their distance, due to the voxels'
 #: edge h: OBJECT_ERROR s^OBJECT_STRENGTH_ORDER (h / L)^2, about, with the size L of a surface and
 #: s = 1 - exp(-sigma_t L), the share of the radiance that the medium scatters within its size.
@@ -208,12 +210,16 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
     data, frame = (medium.original or medium).sigma_t.grid, medium.frame
     lengths = np.linalg.norm(frame[:3, :3], axis=0)
     mean, border = _colliding_extinction(medium), _border_extinction(medium)
-    # Number of voxels along x, y, z that each criterion requires.
+    # Number of voxels along x, y, z that each criterion requires. A long medium with surfaces has
+    # as many voxels as a cube: detail near surfaces is as fine across it as along it.
+    share = lengths / lengths.max()
+    if not medium.is_isolated:
+        share = np.minimum(lengths / np.cbrt(np.prod(lengths)), MOST_ELONGATED)
     fewest = f"at least {rule.fewest}"
-    wanted = {fewest: rule.fewest * lengths / lengths.max()}
+    wanted = {fewest: rule.fewest * share}
     if medium.holds_emitters:
         count = round(FINER_AROUND_EMITTERS * rule.fewest)
-        wanted[f"at least {count} around emitters"] = count * lengths / lengths.max()
+        wanted[f"at least {count} around emitters"] = count * share
     opaque = data is not None and mean * data.voxel_size.max() > VERY_OPAQUE
     if data is not None:
         ratio = np.ones(3)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import UnsupportedSceneError
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.consistency import check_media_agree
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -196,3 +197,21 @@ def test_contradictions_are_refused(build, message):
     with pytest.raises(UnsupportedSceneError, match=f"(?s){message}") as caught:
         check_media_agree(load(**build()))
     assert "volpath" in str(caught.value)
+
+
+@pytest.mark.parametrize(("place", "named", "warns"), [(0, False, 1), (0, True, 0), (5, False, 0)])
+def test_sensors_in_media_that_they_do_not_name_are_noted(scenes, monkeypatch, place, named, warns):
+    """Their images lacked the medium in front of surfaces, without a word."""
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
+    fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5, "id": "fog"}
+    to_world = mi.ScalarTransform4f().look_at([0, 0, -place], [0, 0.1, 1], [0, 1, 0])
+    sensor = {"type": "perspective", "to_world": to_world, "id": "eye"}
+    if named:
+        sensor["medium"] = {"type": "ref", "id": "fog"}
+    box = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "ref", "id": "fog"}}
+    ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.2}
+    compile_scene(
+        mi.load_dict({"type": "scene", "fog": fog, "eye": sensor, "box": box, "ball": ball})
+    )
+    assert sum('"eye" is located in medium "fog"' in text for text in messages) == warns

@@ -69,6 +69,20 @@ def test_an_albedo_of_finer_data_is_resolved_where_it_matters(sigma_t, expected)
         assert shape[axis] == expected
 
 
+def test_long_media_with_surfaces_have_as_many_voxels_as_cubes():
+    """A corridor had 11 voxels across, and lamps under its ceiling an error of 12 % in a block."""
+    corridor = medium(np.full((1, 1, 1), 0.1), (2.0, 2.0, 8.0))
+    rule = solver_named("sweep").size_rule
+    assert choose_grid(corridor, 0, rule)[0].shape == (32, 8, 8)
+    among = {"is_isolated": False}
+    for more, expected in (({}, (80, 20, 20)), ({"holds_emitters": True}, (120, 30, 30))):
+        other = corridor.replaced(context=MediumContext(**among, **more))
+        assert choose_grid(other, 0, rule)[0].shape == expected
+    layer = medium(np.full((1, 1, 1), 0.1), (100.0, 100.0, 1.0))
+    layer = layer.replaced(context=MediumContext(**among))
+    assert choose_grid(layer, 0, rule)[0].shape == (1, 128, 128)
+
+
 def test_dense_grids_are_refined_by_optical_depth():
     """Dense grids are refined per axis by the optical depth, by a factor of eight at most, which
     is even from four on; opaque ones by ten.
