@@ -43,6 +43,7 @@ from mitsuba_irrcache.scene.consistency import (
     warn_of_missing_medium,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.scene.occluders import corners_of
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     Media,
@@ -124,7 +125,7 @@ def compile_scene(
         visible = tuple(grid for grid in grids if grid.name in names)
         if not visible:
             _warn_that_none_is_visible(emission, reason)
-        _warn_of_scale(scene, grids)
+        _warn_of_scale(grids)
         _warn_of_coincidence(scene, grids)
     for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
@@ -442,17 +443,18 @@ def _warn_of_lost_bounds(scene: mi.Scene) -> None:
         )
 
 
-def _warn_of_scale(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
-    """Log a warning if Mitsuba's ray offset is large compared to a medium."""
-    corners = np.abs(bounds_of_shapes(scene))
-    offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
+def _warn_of_scale(grids: Sequence[MediumGrid]) -> None:
+    """Log a warning if Mitsuba's offset of rays from surfaces near a medium, which is proportional
+    to their distance from the origin, is large compared to the medium.
+    """
     for grid in grids:
+        offset = (1 + np.abs(corners_of(grid.frame)).max()) * RAY_OFFSET
         size = np.linalg.norm(grid.frame[:3, :3], axis=0).min()
         if offset > LARGEST_OFFSET * size:
             mi.Log(
                 mi.LogLevel.Warn,
                 f'irrcache: medium "{grid.name}" is {size:.2g} thin, and rays that leave surfaces '
-                f"in this scene skip up to {offset:.1g}, as in volpath: the image is too dark. "
+                f"near it skip up to {offset:.1g}, as in volpath: the image is too dark. "
                 "Scale the scene up, or move it to the origin.",
             )
 

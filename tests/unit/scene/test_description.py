@@ -195,3 +195,23 @@ def test_sizes_of_objects_are_those_within_the_medium(scenes):
     description = compile_scene(mi.load_dict({"type": "scene", "box": box} | objects))
     (medium,) = description.visible
     np.testing.assert_allclose(medium.object_sizes, [0.1, 0.4], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("distance", "floor", "warns"), [(0, 500, 0), (100, 5, 1)])
+def test_media_far_from_the_origin_are_noted(monkeypatch, distance, floor, warns):
+    """Rays skip a part of a medium by its own distance from the origin, not that of other shapes:
+    a large floor is no reason for a warning.
+    """
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
+    transform = mi.ScalarTransform4f
+    box = {
+        "type": "cube",
+        "to_world": transform().translate((distance, 0, 0)),
+        "bsdf": {"type": "null"},
+        "interior": {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5},
+    }
+    place = transform().translate((0, -2, 0)).rotate((1, 0, 0), -90).scale(floor)
+    ground = {"type": "rectangle", "to_world": place}
+    compile_scene(mi.load_dict({"type": "scene", "box": box, "ground": ground}))
+    assert sum("rays that leave surfaces near it skip" in text for text in messages) == warns
