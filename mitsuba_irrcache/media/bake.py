@@ -195,21 +195,25 @@ def _compare(medium: mi.Medium, grid: MediumGrid, name: str, p: mi.Point3f) -> N
     inexact_sigma_t = error_of_texture_units(grid.sigma_t, p)
     inexact_albedo = error_of_texture_units(grid.albedo, p)
     inexact_sigma_s = own_sigma_t * inexact_albedo + own_albedo * inexact_sigma_t
+    error_sigma_t = dr.max(dr.abs(mi.Spectrum(sigma_t) - own_sigma_t) - inexact_sigma_t)
     error = dr.maximum(
-        dr.max(dr.abs(mi.Spectrum(sigma_t) - own_sigma_t) - inexact_sigma_t),
-        dr.max(dr.abs(mi.Spectrum(sigma_s) - own_sigma_s) - inexact_sigma_s),
+        error_sigma_t, dr.max(dr.abs(mi.Spectrum(sigma_s) - own_sigma_s) - inexact_sigma_s)
     )
-    worst = float(dr.max(error)[0]) / scale
+    worst, worst_sigma_t = (float(dr.max(e)[0]) / scale for e in (error, error_sigma_t))
     if worst > 0.02:
-        raise volume_error(f"{name}, off by {worst:.1%} of its maximum,")
+        what = "sigma_t" if worst_sigma_t > 0.02 else "albedo"
+        raise volume_error(f"{what} of {name}, off by {worst:.1%} of its maximum,")
     # A few dense voxels hide errors elsewhere: compare with the extinction at each point, too, but
     # for single points that rounding puts on the other side of a face.
     least = dr.opaque(mi.Float, SMALL_EXTINCTION * scale)
     local = dr.maximum(dr.max(mi.Spectrum(sigma_t)), least)
-    wrong = int(dr.count(error > MOST_LOCAL_ERROR * local)[0])
+    wrong, wrong_sigma_t = (
+        int(dr.count(e > MOST_LOCAL_ERROR * local)[0]) for e in (error, error_sigma_t)
+    )
     if wrong > MOST_WRONG:
+        what = "sigma_t" if wrong_sigma_t > MOST_WRONG else "albedo"
         raise volume_error(
-            f"{name}, off by more than {MOST_LOCAL_ERROR:.0%} at {wrong} of {VERIFIED} points,"
+            f"{what} of {name}, off by more than {MOST_LOCAL_ERROR:.0%} at {wrong} of {VERIFIED} points,"
         )
 
 
