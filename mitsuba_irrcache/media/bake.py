@@ -213,7 +213,8 @@ def _compare(medium: mi.Medium, grid: MediumGrid, name: str, p: mi.Point3f) -> N
     if wrong > MOST_WRONG:
         what = "sigma_t" if wrong_sigma_t > MOST_WRONG else "albedo"
         raise volume_error(
-            f"{what} of {name}, off by more than {MOST_LOCAL_ERROR:.0%} at {wrong} of {VERIFIED} points,"
+            f"{what} of {name}, off by more than {MOST_LOCAL_ERROR:.0%} at {wrong} of {VERIFIED} "
+            "points,"
         )
 
 
