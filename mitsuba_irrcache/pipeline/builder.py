@@ -68,6 +68,8 @@ class CacheBuilder:
         # it was of the same objects
         self._described: list[CachedMedium] = []
         self._edited = False
+        # whether grids were kept because parameters carried gradients
+        self._keeps_grids = False
         self._stages: list[Stage] = []
         self._checkpointed = 0  # number of active `checkpoints` contexts, which save the caches
         #: whether the first two batches may be rendered while incomplete; see `Solver.preview`
@@ -137,6 +139,8 @@ class CacheBuilder:
         volume = self._emission if isinstance(self._emission, mi.Volume) else None
         version = SceneVersion(scene, volume, self._version)
         changes = version.changes(self._version) if self._version is not None else []
+        if self._keeps_grids and not version.carries_gradients:
+            changes = changes or ["no parameter carries gradients any more"]
         if self._version is None or changes:
             self._edited = bool(changes) and version.shares_objects_with(self._version)
             if self._edited:
@@ -144,6 +148,7 @@ class CacheBuilder:
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
             # Keep grids while parameters carry gradients: another grid makes the objective jump.
             grids = _grids(self.parts) if self._edited and version.carries_gradients else {}
+            self._keeps_grids = bool(grids)
             self.parts, self._described, self._version = [], [], None
             self.revision += 1
             description = compile_scene(scene, self._baked_emission(), self.settings.max_depth)

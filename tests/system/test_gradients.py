@@ -367,6 +367,17 @@ def test_the_grid_is_kept_while_parameters_carry_gradients(rgb):
         mi.render(scene, params, spp=1)
         shapes.append(scene.integrator().cache.grid.shape)
     assert shapes[0] == shapes[1] != shapes[2]
+    params[key] = data
+    dr.enable_grad(params[key])
+    params.update()
+    mi.render(scene, params, spp=1)
+    assert scene.integrator().cache.grid.shape == shapes[2]
+    # The same values without gradients.
+    dr.disable_grad(params[key])
+    params.set_dirty(key)
+    params.update()
+    mi.render(scene, params, spp=1)
+    assert scene.integrator().cache.grid.shape == shapes[0]
 
 
 def test_parameters_without_gradients_cost_nothing(rgb, kernels):
