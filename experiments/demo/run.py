@@ -94,7 +94,9 @@ def compare(scene_file: Path, output: Path, size: int, reference_spp: int) -> No
     for name, cache, projection, result in rows:
         rmse = metrics.net_rmse(result, *halves) / mean
         bias = metrics.mean_error(result, *halves) / mean
-        print(f"{name:<20}{cache:>12}{projection:>12}{rmse:>10.2%}{bias:>12.2%}")
+        # The estimate of a small square may be negative, within the noise of the reference.
+        error = f"{rmse:.2%}" if rmse > 0 else f"< {-rmse:.2%}"
+        print(f"{name:<20}{cache:>12}{projection:>12}{error:>10}{bias:>12.2%}")
     print(
         f"(in units of the mean radiance, {size} x {size} pixels; the reference's noise is removed)"
     )
