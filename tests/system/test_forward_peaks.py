@@ -94,7 +94,7 @@ def error(view: dict, spp: int, settings: dict | None = None, **objects: dict) -
 
 @pytest.mark.parametrize(
     ("kind", "angle", "depth", "g", "albedo", "tint"),
-    # Of suns that in coloured extinction, of emitters at a finite distance the lamp.
+    # Quick: the sun in coloured extinction, and the lamp for emitters at a finite distance.
     [
         pytest.param("sun", 8, 4.0, 0.85, 0.95, (1.0,), marks=pytest.mark.slow),
         pytest.param("sun", 4, 3.0, 0.7, 0.95, (1.0,), marks=pytest.mark.slow),

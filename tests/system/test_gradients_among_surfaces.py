@@ -29,8 +29,8 @@ def fewer_paths(monkeypatch):
     monkeypatch.setattr(surroundings, "EXCHANGED", 1 << 16)
 
 
-# Of what `make stress` runs, the floor and a sun are in the test in colour, a window in that of
-# panes, and a distant object in `test_a_distant_object_changes_nothing`.
+# Other quick tests cover the slow cases: the test in colour has a floor and a sun, that of panes a
+# window, and `test_a_distant_object_changes_nothing` a distant object.
 @pytest.mark.parametrize(
     ("name", "parameters"),
     [

@@ -180,7 +180,7 @@ def test_no_image_of_other_inputs_stays_beside_those_of_a_run(frames, tmp_path, 
 
 
 def test_images_that_are_none_of_the_frames_are_named(frames, capsys):
-    """Those of a longer run, or of other sensors, until they are deleted."""
+    """Images of a longer run, or of other sensors, are named until they are deleted."""
     assert frames("--vary", "sigma_t=1:4:4", "-i", "volpath")[0] == 0
     assert "no frames" not in capsys.readouterr().err
     Path("frames/frame-0009.exr").write_text("mine")
