@@ -36,6 +36,9 @@ SPP = 1024
 PILOT, FIRST = 7, 2
 #: The table of the documents for each number of voxels along a side.
 TABLES = {32: "optimisation-32", 64: "optimisation-64"}
+#: Ratio of the CPU time to the budget at which Adam is stopped: steps take longer as a medium
+#: becomes denser, without limit where noise of the gradients does that.
+LONGEST = 2.0
 #: Largest number of iterations of L-BFGS, which ends with the last budget.
 MANY = 10_000
 
@@ -212,7 +215,12 @@ class Comparison:
             return {b: [h for h in history if h[0] <= b][-1] for b in self._budgets}
         seconds, _ = self._run(method, replace(settings, steps=PILOT))
         steps = max(round(budget / seconds * PILOT), 2)
-        seconds, values = self._run(method, replace(settings, steps=steps))
+
+        def stop(seconds: float, _: Result) -> None:
+            if seconds > LONGEST * budget:
+                raise BudgetSpentError
+
+        seconds, values = self._run(method, replace(settings, steps=steps), stop)
         return {budget: (seconds, steps, values)}
 
     def _run(
