@@ -11,7 +11,7 @@ where camera rays end.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -311,14 +311,12 @@ class SurfaceIrradiance:
         """Solve E = E_0 + H E by iteration."""
         # docs/primer, eq. (5.8)
         total = [concatenated([part.own[c] for part in self._exchange]) for c in self._channels]
-        for _ in range(MOST_ITERATIONS):
+
+        def following(total: list[mi.Float]) -> list[mi.Float]:
             parts = [part.gathered(total) for part in self._exchange]
-            following = [concatenated([part[c] for part in parts]) for c in self._channels]
-            change, scale = _change(following, total)
-            total = following
-            if not change > CONVERGED * scale:
-                break
-        self.paths.irradiance = total
+            return [concatenated([part[c] for part in parts]) for c in self._channels]
+
+        self.paths.irradiance = _fixed_point(following, total, CONVERGED)
 
     def _more_rays(self, error: float) -> int:
         """Return by what factor, a power of two, there should be more rays for a standard
@@ -349,13 +347,11 @@ class SurfaceIrradiance:
         """
         channels = len(self._channels)
         mean = sum(self.paths.irradiance) * (1 / channels)
-        total = dr.repeat(mean, PARTS)
-        for _ in range(MOST_ITERATIONS):
-            following = concatenated([part.parts_gathered(total) for part in self._exchange])
-            change, scale = _change([following], [total])
-            total = following
-            if not change > PARTS_CONVERGED * scale:
-                break
+
+        def following(total: list[mi.Float]) -> list[mi.Float]:
+            return [concatenated([part.parts_gathered(*total) for part in self._exchange])]
+
+        (total,) = _fixed_point(following, [dr.repeat(mean, PARTS)], PARTS_CONVERGED)
         lane = dr.arange(mi.UInt32, (end - first) * PARTS) + dr.opaque(mi.UInt32, first * PARTS)
         _, part = Divisor(PARTS).split(lane)
         sums = dr.zeros(mi.Float, PARTS)
@@ -403,12 +399,18 @@ class Exchange:
         return self.parts + dr.block_sum(received, rays)
 
 
-def _change(following: list[mi.Float], total: list[mi.Float]) -> tuple[float, float]:
-    """Return the sum of the absolute differences of arrays, and the sum of the first ones."""
-    change = sum(dr.sum(dr.abs(a - b)) for a, b in zip(following, total, strict=True))
-    scale = sum(dr.sum(a) for a in following)
-    dr.eval(following, change, scale)
-    return float(change[0]), float(scale[0])
+def _fixed_point(
+    following: Callable[[list[mi.Float]], list[mi.Float]], total: list[mi.Float], converged: float
+) -> list[mi.Float]:
+    """Iterate ``following`` from ``total`` until the relative change is at most ``converged``."""
+    for _ in range(MOST_ITERATIONS):
+        before, total = total, following(total)
+        change = sum(dr.sum(dr.abs(a - b)) for a, b in zip(total, before, strict=True))
+        scale = sum(dr.sum(a) for a in total)
+        dr.eval(total, change, scale)
+        if not change[0] > converged * scale[0]:
+            break
+    return total
 
 
 def _henyey_greenstein(g: mi.Float, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:

@@ -130,17 +130,15 @@ def warn_of_missing_medium(scene: mi.Scene, sensor: mi.Sensor) -> None:
     around = around[around > 0]
     if around.size <= 0.5 * int(known[0]):
         return
-    media = {m for s in scene.shapes() for m in (s.interior_medium(), s.exterior_medium()) if m}
     named = Counter(around.tolist()).most_common(1)[0][0]
-    for medium in media:
-        if int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium))[0]) == named:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f'irrcache: sensor "{sensor.id()}" is located in medium "{medium.id()}", but names '
-                "no medium, so that its rays begin in vacuum, as with Mitsuba's integrators: the "
-                "image lacks the medium between sensor and surfaces, and is not that of volpath "
-                "either. Reference the medium within the sensor.",
-            )
+    shapes = scene.shapes()
+    mi.Log(
+        mi.LogLevel.Warn,
+        f'irrcache: sensor "{sensor.id()}" is located in {_Names(shapes, shapes).medium(named)}, '
+        "but names no medium, so that its rays begin in vacuum, as with Mitsuba's integrators: the "
+        "image lacks the medium between sensor and surfaces, and is not that of volpath either. "
+        "Reference the medium within the sensor.",
+    )
 
 
 def _nothing_is_outside(shapes: list[mi.Shape]) -> mi.Bool:

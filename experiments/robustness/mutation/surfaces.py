@@ -64,8 +64,8 @@ SURFACES = (
     Mutant(
         "nodes receive only direct light",
         "render/surface_irradiance.py",
-        "        for _ in range(MOST_ITERATIONS):\n            parts = [",
-        "        for _ in range(0):\n            parts = [",
+        "    for _ in range(MOST_ITERATIONS):\n",
+        "    for _ in range(0):\n",
         (IMAGES,),
     ),
     Mutant(
