@@ -370,7 +370,10 @@ def _root_field(
     channels = [dr.sqrt(c) for c in values]
     if all(dr.all(c == channels[0])[0] for c in channels[1:]):
         channels = channels[:1]
-    return RootField(grid, spread(grid, voxels, channels, classes), len(channels))
+    separated, count = None if classes is None else classes.separated, len(channels)
+    field = RootField(grid, spread(grid, voxels, channels, classes), count, separated=separated)
+    field.data = dr.minimum(field.data, 1)
+    return field
 
 
 def spread(

@@ -92,7 +92,7 @@ def root_field(
     roots = conserving(grid, roots, known, channels, share, separated)
     if classes is not None:
         roots = classes.filled(roots, channels)
-    return RootField(grid, roots, channels, variance, fitted)
+    return RootField(grid, roots, channels, variance, fitted, separated)
 
 
 def moment_field(

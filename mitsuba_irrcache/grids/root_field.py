@@ -11,8 +11,13 @@ import numpy as np
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 
-#: Maximum ratio of neighbouring square roots of irradiance used for extrapolation.
-STEEPEST = 4.0
+#: Maximum ratio of neighbouring square roots of irradiance used for extrapolation, and by how much
+#: that ratio may exceed the square of the ratio further inwards: in smooth fields it does not, but
+#: beside the edge of a shadow only one ratio is large.
+STEEPEST, STEEPER = 4.0, 1.2
+#: Number of standard deviations of a ratio by which noisy values may exceed that limit, if no
+#: surfaces are among the voxels.
+DEVIATIONS = 4
 
 
 class Border(Protocol):
@@ -43,10 +48,11 @@ class RootField(GridField):
         channels: int,
         variance: mi.Float | None = None,
         border: Border | None = None,
+        separated: tuple[mi.Bool, mi.Bool, mi.Bool] | None = None,
     ) -> None:
         """Extrapolate ``roots``, see `extrapolated`."""
         self.inner, extension = grid, Extension(grid)
-        roots = extrapolated(extension, roots, channels, variance, border)
+        roots = extrapolated(extension, roots, channels, variance, border, separated)
         super().__init__(extension.grid, roots, channels)
         self.maximum = self.maximum**2
 
@@ -114,8 +120,9 @@ class Extension:
         """Return the nearest voxels of the original grid."""
         return self.inner.index(*(nearest for nearest, _ in self._nearest(voxel)))
 
-    def inwards(self, voxel: mi.UInt32) -> list[mi.UInt32]:
-        """Return for each axis the neighbour of the nearest original voxel in inward direction.
+    def inwards(self, voxel: mi.UInt32, distance: int = 1) -> list[mi.UInt32]:
+        """Return for each axis the voxel at a ``distance`` from the nearest original voxel, in
+        inward direction, or the opposite border if that is nearer.
 
         It equals the nearest voxel unless the extended voxel lies outside the grid along that axis.
         """
@@ -123,7 +130,10 @@ class Extension:
         places = [near for near, _ in nearest]
         found = []
         for axis, (near, step) in enumerate(nearest):
-            next_ = mi.UInt32(mi.Int32(near) + step)
+            next_ = mi.Int32(near) + step * distance
+            if distance > 1:
+                next_ = dr.clip(next_, 0, self.inner.sides[axis] - 1)
+            next_ = mi.UInt32(next_)
             found.append(self.inner.index(*places[:axis], next_, *places[axis + 1 :]))
         return found
 
@@ -144,14 +154,18 @@ def extrapolated(
     channels: int = 1,
     variance: mi.Float | None = None,
     border: Border | None = None,
+    separated: tuple[mi.Bool, mi.Bool, mi.Bool] | None = None,
 ) -> mi.Float:
     """Extrapolate square roots to the extended grid, axis by axis.
 
     The outermost value is multiplied by its ratio to the next inner one, which is clamped to [1 /
-    `STEEPEST`, `STEEPEST`]. Ratios of noisy values are too large on average: with relative
-    variances v and v' of the two voxels, the factor 1 - 0.36 (v + v') makes the mean over the outer
-    half voxel correct (second moments of the weights 0 to 1/2, and 4/9 for the other two axes).
-    Where the medium is dense, the ratio follows from the profile of the ``border``.
+    `STEEPEST`, `STEEPEST`], and limited by the ratio of the second to the third value (`STEEPER`).
+    ``separated`` is, for x, y, z, a mask of the voxels that a surface separates from the next one
+    along this axis: their values have no ratio. Ratios of noisy values are too large on
+    average: with relative variances v and v' of the two voxels, the factor 1 - 0.36 (v + v') makes
+    the mean over the outer half voxel correct (second moments of the weights 0 to 1/2, and 4/9 for
+    the other two axes). Where the medium is dense, the ratio follows from the profile of the
+    ``border``.
     """
     index = dr.arange(mi.UInt32, extension.grid.voxel_count * channels)
     voxel = index // channels
@@ -159,16 +173,33 @@ def extrapolated(
     inside = extension.inside(voxel)
     outermost = dr.gather(mi.Float, roots, inside * channels + channel)
     result = outermost
-    for axis, further in enumerate(extension.inwards(voxel)):
-        beyond, place = further != inside, further * channels + channel
+    inner = zip(extension.inwards(voxel), extension.inwards(voxel, 2), strict=True)
+    for axis, (second, third) in enumerate(inner):
+        beyond, place = second != inside, second * channels + channel
         other = dr.gather(mi.Float, roots, place)
         known = beyond & (outermost > 0) & (other > 0)
+        before = dr.gather(mi.Float, roots, third * channels + channel)
+        has_third = (third != second) & (before > 0)
+        if separated is not None:
+            apart = separated[axis]
+            known &= ~dr.gather(mi.Bool, apart, dr.minimum(inside, second))
+            before = dr.select(dr.gather(mi.Bool, apart, dr.minimum(second, third)), other, before)
         ratio = dr.clip(outermost / dr.select(known, other, 1), 1 / STEEPEST, STEEPEST)
+        further = dr.maximum(other / dr.select(has_third, before, 1), 1)
+        most = STEEPER * dr.square(further)
         if variance is not None:
             noise = dr.gather(mi.Float, variance, inside * channels + channel)
-            ratio = ratio * (1 - 0.36 * (noise + dr.gather(mi.Float, variance, place)))
+            noise += dr.gather(mi.Float, variance, place)
+            if separated is None:
+                most *= 1 + DEVIATIONS * dr.sqrt(noise)
+        most = dr.select(has_third, most, STEEPEST)
+        ratio = dr.minimum(ratio, most)
+        if variance is not None:
+            ratio = ratio * (1 - 0.36 * noise)
         if border is not None:
             ratio = border.growth(axis, inside, channel, ratio, known)
+            if separated is not None:
+                ratio = dr.minimum(ratio, most)
         result = dr.select(known, result * ratio, result)
     dr.eval(result)
     return result

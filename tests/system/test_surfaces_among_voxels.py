@@ -254,3 +254,23 @@ def test_lamps_may_lie_anywhere_in_a_voxel(scenes, towards):
     (front, behind), (fine_front, fine_behind) = sides
     assert front == pytest.approx(fine_front, rel=0.015)
     assert behind == pytest.approx(fine_behind, rel=0.1)
+
+
+@pytest.mark.parametrize("solver", with_slow(["sweep", "path"], "path"))
+def test_values_are_not_extrapolated_across_surfaces(scenes, solver):
+    """A tilted block reaches through faces of the medium, and leaves wedges thinner than a voxel.
+
+    The irradiance there was extrapolated by its ratio to voxels within or behind the block, to 14
+    times the largest value in the medium, and a part of the image was 15 % too bright.
+    """
+    turned = mi.ScalarTransform4f().translate([0.5, 0.7, 0.2]).rotate([0, 0, 1], 15)
+    turned = turned.rotate([1, 0, 0], 15).scale([0.45, 0.3, 0.45])
+    objects = {
+        "fog": fog((2.4,) * 3, (0.5,) * 3),
+        "box": bound("cube", ref("fog")),
+        "block": {"type": "cube", "to_world": turned, "bsdf": diffuse(0, 0, 0)},
+        "emitter": {"type": "directional", "direction": [-0.88, -1, -0.14], "irradiance": 3.0},
+    }
+    _, cache = rendered(scenes, objects, solver=solver, resolution=32)
+    largest = np.array(cache.irradiance).max()
+    assert cache.field().maximum < 4 * largest
