@@ -15,7 +15,8 @@ from tqdm import tqdm
 
 from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.io.files import atomic_write
-from mitsuba_irrcache.io.scene_files import load_scene, loses_emission
+from mitsuba_irrcache.io.scene_files import load_scene, loses_emission, parse_integrator
+from mitsuba_irrcache.pipeline.defaults import warn_of_clear_channel
 
 from .scene_files import scene_digest
 
@@ -106,6 +107,9 @@ def reference(
     if found is not None and found.spp >= spp and found.seconds >= seconds:
         return found
     scene = load_scene(scene_file, parameters, integrator)
+    name = parse_integrator(integrator)[0]
+    if "volpath" in name:
+        warn_of_clear_channel(scene, name)
     saved = time.perf_counter()
     with tqdm(
         desc=f"reference {path.stem}", unit="spp", delay=1.0, leave=False, disable=None

@@ -14,6 +14,7 @@ from mitsuba_irrcache.imaging.stock import StockIntegrators
 from mitsuba_irrcache.imaging.stock_estimate import StockImage, cheaper_stock_image
 from mitsuba_irrcache.pipeline.builder import Progress
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
+from mitsuba_irrcache.pipeline.defaults import medium_with_clear_channel, warn_of_clear_channel
 from mitsuba_irrcache.render.camera import CameraRays, ClosedFormCameraRays, TracedCameraRays
 from mitsuba_irrcache.render.certificate import Certificate
 from mitsuba_irrcache.scene.consistency import check_sensor
@@ -155,6 +156,8 @@ class CameraRaySource:
             parts = builder.parts
             if not parts or builder.carries_gradients or not builder.is_untouched:
                 return None
+            if medium_with_clear_channel(scene) is not None:
+                return None
             stock.choose(scene)
             spent = self._without_caches[1] if self._without_caches[0] is parts else 0.0
             spp = spp or sensor.sampler().sample_count()
@@ -210,6 +213,7 @@ class CameraRaySource:
                 "irrcache: no medium is visible, so no cache is used: "
                 f"{self._stock.name} renders this scene ({reason}).",
             )
+            warn_of_clear_channel(scene, self._stock.name)
 
     def _log_what_is_missing(self) -> None:
         done, target = self.builder.done, self.builder.target

@@ -18,7 +18,7 @@ def colour(*rgb: float) -> dict:
 
 
 def fog(extinction=(1.0, 1.0, 1.0), albedo=(0.9, 0.9, 0.9)) -> dict:
-    scale = max(extinction)
+    scale = max(extinction) or 1.0
     sigma_t = colour(*(v / scale for v in extinction))
     return {
         "type": "homogeneous", "sigma_t": sigma_t, "albedo": colour(*albedo), "scale": scale,
