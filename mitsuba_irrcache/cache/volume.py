@@ -6,7 +6,7 @@ file format in `storage`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
 from threading import RLock
@@ -223,10 +223,24 @@ class IrradianceCache:
         Square roots are interpolated, and too small on average for large variances. Each voxel
         contributes at most 1. It is that of the noisiest channel.
         """
-        means, found = self._sums.irradiance(), []
-        for channel, mean in enumerate(means):
+        return self._mean_relative_variance(mi.Float(1))
+
+    @_consistent
+    def relative_variance_seen_from(self, position: Sequence[float], sigma_t: float) -> float:
+        """Mean of the variances of `relative_variance`, weighted by the radiance that a sensor at a
+        world ``position`` within the medium, of the mean extinction ``sigma_t``, receives from the
+        voxels.
+        """
+        away = self.grid.centers(self.active) - mi.Point3f(*map(float, position))
+        distance = dr.maximum(dr.norm(away), 0.5 * float(self.grid.voxel_size.max()))
+        return self._mean_relative_variance(dr.exp(-sigma_t * distance) / dr.square(distance))
+
+    def _mean_relative_variance(self, weights: mi.Float) -> float:
+        """Average relative variances with these weights times the irradiance."""
+        found = []
+        for channel, mean in enumerate(self._sums.irradiance()):
             variance = self._sums.relative_variance(mean, channel)
-            found.append((dr.sum(mean * variance), dr.sum(mean)))
+            found.append((dr.sum(weights * mean * variance), dr.sum(weights * mean)))
         dr.eval(found)
         return max(float(sum_[0]) / max(float(total[0]), 1e-30) for sum_, total in found)
 

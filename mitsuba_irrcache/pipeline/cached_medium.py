@@ -35,6 +35,7 @@ from mitsuba_irrcache.lights.narrow_sources import MAX_LAMPS, sources_of
 from mitsuba_irrcache.machine.memory import release_unused_memory, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache
+from mitsuba_irrcache.scene.consistency import camera_rays
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.fingerprint import differing, digests
 from mitsuba_irrcache.scene.media_shares import why_shared
@@ -45,15 +46,23 @@ from mitsuba_irrcache.solvers.grid_size import (
     choose_grid,
     densest_border_depth,
     error_at_boundary,
+    mean_extinction,
     warn_of_dense_border,
     warn_of_opaque_voxels,
     warn_of_unresolved_detail,
+    warn_of_unresolved_objects,
 )
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 
 #: Relative variance of voxels above which a warning is logged: images around a flame that few
 #: directions meet are 2 to 4 % too dark with 0.2, and 40 % with 0.7.
 LARGE_VARIANCE = 0.15
+#: The same for voxels around a sensor within the medium, weighted by what it receives from them:
+#: haze in which nearly all radiance is absorbed or scattered before it arrives has errors of 2 to
+#: 5 % with 0.1, and 4 to 15 % with 0.3.
+LARGE_VARIANCE_AROUND_SENSOR = 0.06
+#: Number of rays whose mean origin is the position of a sensor.
+SENSOR_RAYS = 16
 #: Lock of the thread that writes a cache file.
 _SAVING = Lock()
 
@@ -215,11 +224,14 @@ class CachedMedium:
                 "lower the radiance of the emitters, and check sigma_t and albedo."
             )
         if not self.is_dark and self.settings.warns:
-            self._warn_of_noise()
+            self._warn_of_noise(scene)
         return True
 
-    def _warn_of_noise(self) -> None:
-        """Log a warning, once for a cache, if voxels that are sampled alone have too much noise."""
+    def _warn_of_noise(self, scene: mi.Scene) -> None:
+        """Log a warning, once for a cache, if voxels that are sampled alone have too much noise.
+
+        Voxels around sensors of the scene have a limit of their own.
+        """
         enough = self.cache.samples >= self.target(self.settings.samples)
         if self._has_known_noise or not enough or not self.cache.has_own_errors:
             return
@@ -232,6 +244,26 @@ class CachedMedium:
                 f"{100 * np.sqrt(variance):.0f} %, because few samples meet what emits: the image "
                 f"is too dark where it is scattered. Raise cache_spp (now {self.cache.samples}).",
             )
+            return
+        variance = max(map(self._variance_seen_by, scene.sensors()), default=0.0)
+        if variance > LARGE_VARIANCE_AROUND_SENSOR:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"irrcache: {self.label}the irradiance of voxels around the sensor has a noise of "
+                f"{100 * np.sqrt(variance):.0f} %, because few paths reach an emitter from there: "
+                f"errors of several percent are expected. Raise cache_spp (now "
+                f"{self.cache.samples}).",
+            )
+
+    def _variance_seen_by(self, sensor: mi.Sensor) -> float:
+        """Return the relative variance of the voxels around a sensor; 0 if it is not within the
+        medium.
+        """
+        ray, _ = camera_rays(sensor, SENSOR_RAYS)
+        position = np.array(ray.o, dtype=float).reshape(3, -1).mean(axis=1)
+        if not self.medium.contains(mi.Point3f(*position.tolist()))[0]:
+            return 0.0
+        return self.cache.relative_variance_seen_from(position, mean_extinction(self.medium))
 
     def close(self) -> bool:
         """Discard incomplete batches; return whether there were any."""
@@ -248,6 +280,7 @@ class CachedMedium:
             warn_of_dense_border(medium, grid, settings.max_depth)
             if not warn_of_opaque_voxels(medium, grid, settings.max_depth):
                 warn_of_unresolved_detail(medium, grid)
+            warn_of_unresolved_objects(medium, grid)
         whole = np.zeros(3, int), grid.resolution
         self.shared = None if medium.is_isolated else why_shared(scene, medium, grid, whole)
         active, classes = self._active_voxels(scene, grid)

@@ -98,7 +98,7 @@ def check_sensor(scene: mi.Scene, sensor: mi.Sensor) -> None:
     if medium is None:
         return
     shapes = [s for s in scene.shapes() if _bounds(s)]
-    ray, _ = _camera_rays(sensor, RAYS)
+    ray, _ = camera_rays(sensor, RAYS)
     code, found, shape = _claims(scene, mi.Ray3f(ray.o, ray.d))
     outside = _nothing_is_outside(shapes)
     known = (code == _CLAIM) | (code == _ESCAPE) & outside
@@ -121,7 +121,7 @@ def warn_of_missing_medium(scene: mi.Scene, sensor: mi.Sensor) -> None:
     """Log a warning for a sensor in a medium that it does not name: its rays begin outside."""
     if sensor.get_medium() is not None:
         return
-    ray, _ = _camera_rays(sensor, RAYS)
+    ray, _ = camera_rays(sensor, RAYS)
     code, found, _ = _claims(scene, mi.Ray3f(ray.o, ray.d))
     number = dr.select(code == _CLAIM, dr.reinterpret_array(mi.UInt32, found), 0)
     known = dr.count(code != _NOTHING)
@@ -150,7 +150,7 @@ def _nothing_is_outside(shapes: list[mi.Shape]) -> mi.Bool:
     return dr.opaque(mi.Bool, all(s.exterior_medium() in (None, *filled) for s in shapes))
 
 
-def _camera_rays(sensor: mi.Sensor, count: int) -> tuple[mi.Ray3f, mi.Spectrum]:
+def camera_rays(sensor: mi.Sensor, count: int) -> tuple[mi.Ray3f, mi.Spectrum]:
     """Sample camera rays uniformly over the film of a sensor."""
     rng = mi.PCG32(count)
     film, aperture = (mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2))
@@ -159,8 +159,11 @@ def _camera_rays(sensor: mi.Sensor, count: int) -> tuple[mi.Ray3f, mi.Spectrum]:
 
 
 def described(shape: mi.Shape) -> str:
-    """Describe a shape for a message."""
-    return f'shape "{shape.id()}" ({shape.class_name()})'
+    """Describe a shape for a message, by its position if the scene does not name it."""
+    if shape.id() and not shape.id().startswith("_unnamed"):
+        return f'shape "{shape.id()}" ({shape.class_name()})'
+    center = ", ".join(f"{float(x):.3g}" for x in np.array(shape.bbox().center()))
+    return f"a shape without id ({shape.class_name()} at {center})"
 
 
 def _bounds(shape: mi.Shape) -> bool:
@@ -200,7 +203,7 @@ def _starts(
     none = dr.zeros(mi.MediumPtr)
     parts = [(count, origin, direction, none, outside)]
     for sensor in scene.sensors():
-        start, _ = _camera_rays(sensor, SENSOR_WALKS)
+        start, _ = camera_rays(sensor, SENSOR_WALKS)
         medium = sensor.get_medium()
         pointer = none if medium is None else mi.MediumPtr(medium)
         parts.append((SENSOR_WALKS, start.o, start.d, pointer, medium is not None))

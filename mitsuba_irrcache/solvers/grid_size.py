@@ -97,8 +97,9 @@ MOST_ELONGATED = 4.0
 #: Found with floors, walls and balls of 20 to 200 units in cubes of 1000 units and optical depths
 #: of 3 to 30. Voxels are refined above NOTABLE_OBJECT_ERROR, for surfaces larger than
 #: SMALLEST_OBJECT of the medium's longest side and WEAKEST_OBJECT of s: the shadows of others are
-#: smaller or weaker.
-OBJECT_ERROR, OBJECT_STRENGTH_ORDER, NOTABLE_OBJECT_ERROR = 45.0, 1.5, 0.75
+#: smaller or weaker. A warning is logged above LARGE_OBJECT_ERROR.
+OBJECT_ERROR, OBJECT_STRENGTH_ORDER = 45.0, 1.5
+NOTABLE_OBJECT_ERROR, LARGE_OBJECT_ERROR = 0.75, 1.5
 SMALLEST_OBJECT, WEAKEST_OBJECT = 0.05, 0.15
 #: Optical depth of a voxel below which the albedo within it hardly matters for the irradiance.
 THIN_VOXEL = 0.02
@@ -169,7 +170,7 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
         grid, reason = Grid.near_cubic(frame, resolution), REQUESTED
     elif medium.is_traced and rule.among_surfaces is not None:
         least, most = rule.among_surfaces.fewest, rule.among_surfaces.most
-        extinction = max(_colliding_extinction(medium), _border_extinction(medium))
+        extinction = max(mean_extinction(medium), _border_extinction(medium))
         longest = np.linalg.norm(frame[:3, :3], axis=0).max()
         edge = _edge_of_error(rule.among_surfaces.target_error, medium)
         count = np.ceil(extinction * longest / edge)
@@ -209,7 +210,7 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
     # docs/primer, eq. (7.2)
     data, frame = (medium.original or medium).sigma_t.grid, medium.frame
     lengths = np.linalg.norm(frame[:3, :3], axis=0)
-    mean, border = _colliding_extinction(medium), _border_extinction(medium)
+    mean, border = mean_extinction(medium), _border_extinction(medium)
     # Number of voxels along x, y, z that each criterion requires. A long medium with surfaces has
     # as many voxels as a cube: detail near surfaces is as fine across it as along it.
     share = lengths / lengths.max()
@@ -251,7 +252,7 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
         if medium.overlaps(other):
             own = COARSER_IN_OTHERS * edge
             reason = f'{1 / own:.1f} per mean free path of medium "{other.name}" in it'
-            count = _colliding_extinction(other) * lengths / own
+            count = mean_extinction(other) * lengths / own
             wanted[reason] = np.minimum(count, rule.most_by_contrast)
     sides = np.max(list(wanted.values()), axis=0)
     reason = max(wanted, key=lambda key: wanted[key].max())
@@ -287,7 +288,7 @@ def _albedo_resolution(medium: MediumGrid) -> np.ndarray:
     if albedo is None:
         return np.zeros(3)
     rate = np.linalg.solve(albedo.to_world[:3, :3], frame) * albedo.resolution[:, None]
-    depth = _colliding_extinction(medium) * np.linalg.norm(frame, axis=0)
+    depth = mean_extinction(medium) * np.linalg.norm(frame, axis=0)
     return np.minimum(np.abs(rate).max(axis=0), depth / THIN_VOXEL)
 
 
@@ -295,15 +296,22 @@ def _resolution_of_objects(medium: MediumGrid) -> tuple[float, np.ndarray]:
     """Return the size of the surfaces in a medium whose shadows need the smallest voxels, and the
     numbers of voxels along x, y, z that resolve these; 0 without such surfaces.
     """
-    lengths = np.linalg.norm(medium.frame[:3, :3], axis=0)
-    sigma_t, edges = _colliding_extinction(medium), {np.inf: 0.0}
+    edge, size = _edge_at_objects(medium, NOTABLE_OBJECT_ERROR)
+    return size, np.linalg.norm(medium.frame[:3, :3], axis=0) / edge
+
+
+def _edge_at_objects(medium: MediumGrid, target: float) -> tuple[float, float]:
+    """Return the edge of voxels at which images of the surfaces in a medium have at most the
+    ``target`` error [%], infinite without surfaces; and the size of those that require it.
+    """
+    longest = np.linalg.norm(medium.frame[:3, :3], axis=0).max()
+    sigma_t, edges = mean_extinction(medium), [(np.inf, 0.0)]
     for size in medium.object_sizes:
         share = -np.expm1(-sigma_t * size)
-        if share > WEAKEST_OBJECT and size > SMALLEST_OBJECT * lengths.max():
+        if share > WEAKEST_OBJECT and size > SMALLEST_OBJECT * longest:
             error = OBJECT_ERROR * share**OBJECT_STRENGTH_ORDER
-            edges[size * np.sqrt(NOTABLE_OBJECT_ERROR / error)] = size
-    edge = min(edges)
-    return edges[edge], lengths / edge
+            edges.append((size * np.sqrt(target / error), size))
+    return min(edges)
 
 
 def _size_in_smooth_light(
@@ -318,7 +326,7 @@ def _size_in_smooth_light(
     if medium.detail is Detail.SHARP or medium.phase.forward:
         return None
     share = (least / most).max()
-    depth = _colliding_extinction(medium) * np.linalg.norm(medium.frame[:3, :3], axis=0)
+    depth = mean_extinction(medium) * np.linalg.norm(medium.frame[:3, :3], axis=0)
     while share <= LARGEST_SHARE:
         sides = np.maximum(share * most, 1)
         edge = (depth / sides).max()
@@ -379,7 +387,7 @@ def _error_of_detail(medium: MediumGrid, sides: np.ndarray) -> float:
         return 0.0
     # docs/primer, eq. (7.3)
     lengths = np.linalg.norm(medium.frame[:3, :3], axis=0)
-    depth = (_colliding_extinction(medium) * lengths / sides).max()
+    depth = (mean_extinction(medium) * lengths / sides).max()
     return UNRESOLVED_ERROR * min(depth, OPAQUE) * _lost_detail(medium, sides)
 
 
@@ -396,7 +404,7 @@ def _refined_for_detail(medium: MediumGrid, sides: np.ndarray, most: int) -> np.
     return sides
 
 
-def _colliding_extinction(medium: MediumGrid) -> float:
+def mean_extinction(medium: MediumGrid) -> float:
     """Return the mean extinction over collisions in uniform radiance, int sigma_t^2 / int sigma_t
     [1/scene unit].
     """
@@ -453,7 +461,7 @@ def warn_of_opaque_voxels(medium: MediumGrid, grid: Grid, max_depth: int) -> boo
     data = (medium.original or medium).sigma_t.grid
     if max_depth == 2 or data is None:
         return False
-    sigma_t = _colliding_extinction(medium)
+    sigma_t = mean_extinction(medium)
     edge, size = data.voxel_size.max(), grid.voxel_size.max()
     error = OPAQUE_ERROR * (sigma_t * edge) ** OPAQUE_DEPTH_ORDER
     error = min(error * (size / edge) ** OPAQUE_SIZE_ORDER, MOST_OPAQUE_ERROR)
@@ -479,6 +487,24 @@ def warn_of_unresolved_detail(medium: MediumGrid, grid: Grid) -> None:
             f"an error of about {error:.1f} % of the mean is expected, and several times as much "
             "in views that show little but this detail. Raise resolution "
             f"(now {max(grid.shape)}), or set tolerance to have it chosen.",
+        )
+
+
+def warn_of_unresolved_objects(medium: MediumGrid, grid: Grid) -> None:
+    """Log a warning if the voxels of the cache are too large for surfaces in a homogeneous medium;
+    in another one, surfaces may lie where it is thin.
+    """
+    if not medium.homogeneous:
+        return
+    edge, size = _edge_at_objects(medium, LARGE_OBJECT_ERROR)
+    largest = grid.voxel_size.max()
+    if largest > edge:
+        error = LARGE_OBJECT_ERROR * (largest / edge) ** 2
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"irrcache: voxels of the cache are large ({largest:.2g}) in comparison to surfaces of "
+            f"size {size:.2g} in the medium: errors of about {min(error, 100):.0f} % are expected "
+            f"around these. Raise resolution (now {max(grid.shape)}).",
         )
 
 

@@ -335,3 +335,22 @@ def test_sensors_in_media_that_are_not_rendered_are_refused(scenes):
     sampler.seed(0, 1)
     with pytest.raises(IrrcacheError, match="which is rendered for none"):
         scene.integrator().sample(scene, sampler, ray, medium)
+
+
+@pytest.mark.parametrize(("distance", "warns"), [(0.0, True), (3.0, False)])
+def test_noise_around_a_sensor_is_announced(scenes, monkeypatch, distance, warns):
+    """Few paths leave the middle of thick haze: images from there have errors of several percent,
+    which voxels at its boundary, where most radiance is scattered, do not.
+    """
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
+    look = mi.ScalarTransform4f().look_at([0, 0, -distance], [0, 0, 1], [0, 1, 0])
+    sensor = {"type": "perspective", "to_world": look, "film": {"type": "hdrfilm", "width": 4,
+              "height": 4}} | ({} if distance else {"medium": ref("fog")})  # fmt: skip
+    settings = {"type": "irrcache", "solver": "path", "max_depth": 3, "resolution": 16}
+    objects = {
+        "fog": fog((7,) * 3, (0.8,) * 3), "sensor": sensor, "box": bound("cube", ref("fog")),
+        "emitter": {"type": "constant"},
+    }  # fmt: skip
+    mi.render(scenes.load(settings | {"cache_spp": 16}, None, **objects), spp=1)
+    assert any("voxels around the sensor has a noise of" in text for text in messages) is warns

@@ -270,6 +270,28 @@ def test_opaque_voxels_are_announced(count, depth, max_depth, warns, monkeypatch
     assert all(level == mi.LogLevel.Warn and "Raise resolution" in t for level, t in messages)
 
 
+@pytest.mark.parametrize(
+    ("size", "sigma_t", "voxels", "error"),
+    [(10.0, 0.1, 20, 6), (10.0, 0.1, 64, None), (10.0, 0.003, 20, None), (2.0, 0.1, 20, None)],
+)
+def test_voxels_that_are_large_beside_surfaces_are_announced(
+    size, sigma_t, voxels, error, monkeypatch
+):
+    """Shadows of large surfaces in haze need voxels of a part of their size; thin haze and small
+    surfaces do not.
+    """
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
+    sparse = medium(np.full((2, 2, 2), sigma_t), (100.0,) * 3)
+    sparse = sparse.replaced(context=MediumContext(object_sizes=(size,)))
+    grid_size.warn_of_unresolved_objects(sparse, Grid((voxels,) * 3, sparse.frame))
+    assert not messages
+    haze = sparse.replaced(sigma_t=ConstantField(np.array([sigma_t])))
+    grid_size.warn_of_unresolved_objects(haze, Grid((voxels,) * 3, haze.frame))
+    assert len(messages) == (error is not None)
+    assert all(f"errors of about {error} %" in text for text in messages)
+
+
 def specks(count: int, sigma_t: float) -> np.ndarray:
     """Return single dense voxels in air."""
     rng = np.random.default_rng(3)
