@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import signal
+import sys
 import time
 from contextlib import closing, contextmanager
 from importlib import metadata
@@ -145,6 +146,13 @@ def run(args: argparse.Namespace) -> int:
         raise IrrcacheError(
             f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), "
             "counted from 0."
+        )
+    if integrator is None and integrator_of(source, parameters) != "irrcache":
+        name = integrator_of(source, parameters)
+        print(
+            f'irrcache: the scene\'s own integrator "{name}" renders the image; '
+            "-i irrcache replaces it.",
+            file=sys.stderr,
         )
     _check_background(scene, args)
     if args.budget or args.error:

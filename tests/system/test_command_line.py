@@ -154,6 +154,18 @@ def test_a_stock_integrator_when_asked(folder):
     assert read(folder / "a.exr").any()
 
 
+def test_integrators_that_are_not_replaced_are_named(folder, capsys):
+    """A path tracer within another integrator remains, and a message says so."""
+    nested = '<integrator type="moment"> <integrator type="volpath"/> </integrator>'
+    text = (folder / "scene.xml").read_text()
+    start, end = text.index("<integrator"), text.index("</integrator>") + len("</integrator>")
+    (folder / "nested.xml").write_text(text[:start] + nested + text[end:])
+    assert run("render", folder / "nested.xml", "-o", folder / "a.exr") == 0
+    assert 'own integrator "moment" renders the image; -i irrcache' in capsys.readouterr().err
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr") == 0
+    assert "own integrator" not in capsys.readouterr().err
+
+
 BAD_CALLS = {
     "missing scene": (["absent.xml"], r"absent\.xml"),
     "not XML": (["density.vol"], r"density\.vol"),
