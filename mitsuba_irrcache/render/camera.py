@@ -344,8 +344,8 @@ class TracedCameraRays:
         chance = dr.minimum(dr.max(transmittance) * (1 / least), 1)
         traced = marched.stopped & (rng.next_float32(marched.stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
+        is_stratified = isinstance(sampler, CameraSampler)
         if self.caches_surfaces:
-            is_stratified = isinstance(sampler, CameraSampler)
             if is_stratified:
                 on_emitter = sampler.emitter_sample()
             else:
@@ -354,7 +354,8 @@ class TracedCameraRays:
                 scene, end, pointer, rng, traced, on_emitter, self.hide_emitters, marched.near
             )
         else:
-            start = PathStart(end, pointer, depth=0, pdf=0.0, clear=True)
+            sample = sampler.emitter_sample().u if is_stratified else None
+            start = PathStart(end, pointer, depth=0, pdf=0.0, clear=True, sample=sample)
             depths = self.max_depth, self.rr_depth
             is_cached = self._is_cached if self._ends_in_media else None
             paths = PathTracer(scene, self.media, *depths, self.hide_emitters, is_cached)

@@ -38,7 +38,9 @@ class PathStart:
     ``depth`` is the number of preceding vertices. ``pdf`` is the density of the ray's direction if
     emitters were also sampled at the previous vertex; 0 if not, so that emitters hit by the ray
     count fully. ``clear`` states that there is no medium before the first surface. The radiance of
-    the emitters ``excluded`` is not added if the ray hits them before any other vertex.
+    the emitters ``excluded`` is not added if the ray hits them before any other vertex. ``sample``
+    in [0, 1)^2 chooses an emitter and a point on it at the first vertex, so that both are
+    stratified over the paths of a pixel; None: they are independent.
     """
 
     def __init__(
@@ -49,10 +51,11 @@ class PathStart:
         pdf: float,
         clear: bool = False,
         excluded: Sequence[mi.EmitterPtr] = (),
+        sample: mi.Point2f | None = None,
     ) -> None:
         self.ray, self.pointer = ray, pointer
         self.depth, self.pdf, self.clear = depth, pdf, clear
-        self.excluded = tuple(excluded)
+        self.excluded, self.sample = tuple(excluded), sample
 
 
 @dataclass
@@ -157,7 +160,8 @@ class PathTracer:
             segment.surface &= segment.si.is_valid()
             scatters = segment.surface & ~skipped
             vertex = segment.vertex(path.ray)
-            self._add_sampled_emitter(path, sums, segment, vertex, scatters)
+            first = None if start.sample is None else (is_direct, start.sample)
+            self._add_sampled_emitter(path, sums, segment, vertex, scatters, first)
             is_vertex = self._scatter(path, segment, vertex, scatters, skipped)
             sums.interacted |= is_vertex
         return sums, path.rng
@@ -250,15 +254,18 @@ class PathTracer:
         segment: _Segment,
         vertex: mi.Interaction3f,
         scatters: mi.Bool,
+        first: tuple[mi.Bool, mi.Point2f] | None,
     ) -> None:
         """Sample an emitter from a vertex, and add its radiance with multiple importance
-        sampling.
+        sampling. ``first`` has the mask of first vertices and `PathStart.sample`.
         """
         si, collided, rng = segment.si, segment.collided, path.rng
         bsdf = si.bsdf()
         smooth = scatters & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         active = (collided | smooth) & (path.depth + 1 < self._max_depth)
         sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+        if first is not None:
+            sample = dr.select(*first, sample)
         record, emitted = self.scene.sample_emitter_direction(vertex, sample, False, active)
         record = with_valid_direction(record)
         active &= (record.pdf > 0) & (dr.max(emitted) > 0)
