@@ -358,7 +358,7 @@ def test_noise_around_a_sensor_is_announced(scenes, monkeypatch, distance, warns
 
 def test_several_emitters_have_little_noise_in_single_scattering(scenes):
     """Every sample of a pixel chooses one of the emitters, evenly over the samples: a floor under
-    two suns has no noise, where independent choices have 18 % with 16 samples.
+    two suns has no noise, where independent choices have 20 % with 16 samples.
     """
     first, second = (
         {"type": "directional", "direction": [x, -1, 0.3], "irradiance": value}
