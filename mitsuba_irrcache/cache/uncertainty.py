@@ -97,10 +97,12 @@ def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     inside = extension.inside(voxel)
     beyond = sum(dr.select(i != inside, mi.Float(1), 0) for i in extension.inwards(voxel))
     inner = dr.gather(mi.Float, roots, inside)
-    border = cache.border
+    border, classes = cache.border, cache.voxel_classes
+    separated = None if classes is None else classes.separated
     if border is not None:
-        border = FittedBorder(border, roots, marked(cache.grid, cache.active), 1)
-    growth = extrapolated(extension, roots, border=border) / dr.select(inner > 0, inner, 1)
+        border = FittedBorder(border, roots, marked(cache.grid, cache.active), 1, separated)
+    beyond_border = extrapolated(extension, roots, border=border, separated=separated)
+    growth = beyond_border / dr.select(inner > 0, inner, 1)
     # Extrapolated roots are a^2 / b (`extrapolated`); their relative error is sqrt(2^2 + 1) times
     # that of equally noisy a and b.
     deviation = dr.gather(mi.Float, deviations, inside) * growth * 5 ** (0.5 * beyond)
