@@ -63,7 +63,7 @@ PEAK_DISTANCE = 0.25
 CHORD = 0.1
 #: Largest spacing of nodes over the extent of the image at their distance, and its smallest value
 #: in pixels: rays from the nodes then find objects that are visible in the image.
-COARSEST_IN_VIEW, COARSEST_PIXELS = 1 / 32, 4.0
+COARSEST_IN_VIEW, COARSEST_PIXELS = 1 / 32, 2.0
 #: Smallest spacing of nodes in pixels where camera rays end; over the extent of the image where
 #: rays from nodes end.
 FINEST_PIXELS, FINEST_IN_VIEW = 0.5, 1 / 64

@@ -189,6 +189,13 @@ class Solver(ABC):
         complete batches remain in the cache.
         """
 
+    @property
+    def direction_noise(self) -> float:
+        """Noise of the irradiance due to directions that neighbouring voxels share: its root mean
+        square over the mean; 0 if unknown.
+        """
+        return 0.0
+
     def use(self, scene: mi.Scene | None) -> None:  # noqa: B027 (most hold nothing)
         """Set the scene for `refine`; None: release it.
 

@@ -201,6 +201,10 @@ class SweepSolver(Solver):
         options = task.seed, task.rr_depth, task.pause
         self._sweep = kind(task.scene, task.medium, task.cache, *options)
 
+    @property
+    def direction_noise(self) -> float:
+        return self._sweep.direction_noise
+
     def use(self, scene: mi.Scene | None) -> None:
         self._sweep.use(scene)
 

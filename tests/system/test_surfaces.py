@@ -376,3 +376,25 @@ def test_several_emitters_have_little_noise_in_single_scattering(scenes):
     rows = image[SIZE - 4 :, :, 0]
     assert rows.std() / rows.mean() < 0.01
     assert rows.mean() == pytest.approx(expected[SIZE - 4 :, :, 0].mean(), rel=0.02)
+
+
+@pytest.mark.parametrize("rows", [4, 16])
+def test_noise_of_directions_is_announced(scenes, monkeypatch, rows):
+    """Few of the directions meet an environment that emits from below only, past a floor: images
+    had errors of 3 % without a message. From a uniform environment there is little noise.
+    """
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
+    radiance = np.zeros((16, 32, 3), np.float32)
+    radiance[16 - rows :] = 2
+    sheet = {"type": "twosided", "bsdf": diffuse(0.5, 0.5, 0.5)}
+    floor = placed((0, -1.3, 0), (0.9, 0.9, 1), (0, -0.3, 0.001))
+    objects = {
+        "fog": fog((1.5,) * 3, (0.98,) * 3),
+        "box": bound("cube", ref("fog")),
+        "floor": {"type": "rectangle", "to_world": floor, "bsdf": sheet},
+        "emitter": {"type": "envmap", "bitmap": mi.Bitmap(radiance)},
+    }
+    settings = {"type": "irrcache", "solver": "sweep", "resolution": 12}
+    mi.render(scenes.load(settings, None, **objects), spp=1)
+    assert any("few directions meet what emits" in text for text in messages) is (rows == 4)

@@ -179,10 +179,15 @@ class BoundaryOrdinateSet:
         return table
 
     def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
-        """Return ``swept`` unchanged: passes differ by their incoming radiance, which a coarse grid
-        does not correct.
+        """Apply `MultigridLevel.coarse_corrected` to a sweep along the ordinates of this set.
+
+        It is omitted with surfaces among the voxels, through which coarse corrections would leak.
+
+        In dense media the result would otherwise depend on the ordinates of the first set alone.
         """
-        return swept
+        if self.incoming.crossings is not None or level.coarsest:
+            return swept
+        return level.coarse_corrected(phi, swept, level.coarser.tables(self.scattering))
 
     def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
         """Solve for all orders, given the uncollided ``b``; radiance may leave the medium and

@@ -160,6 +160,8 @@ class Sweep:
         self._colour = np.ones(cache.channels)
         self._boundary: SurfaceBoundary | None = None
         self._emitter_sampling: EmitterSampling | None = None
+        #: squared noise of each batch, see `direction_noise`
+        self._squared_noise: list[float] = []
         #: irradiance from each point-like emitter, among surfaces
         self._from_points: list[mi.Spectrum] = []
         if medium.is_isolated:
@@ -247,6 +249,12 @@ class Sweep:
                 enclosed = dr.gather(mi.Bool, cache.voxel_classes.enclosed, cache.active)
                 self._albedo = [dr.select(enclosed, 0, albedo) for albedo in self._albedo]
                 dr.eval(self._albedo)
+
+    @property
+    def direction_noise(self) -> float:
+        """See `Solver.direction_noise`; the mean over the batches so far."""
+        count = len(self._squared_noise)
+        return float(np.sqrt(sum(self._squared_noise)) / max(count, 1))
 
     def use(self, scene: mi.Scene | None) -> None:
         """Set the scene in which rays are traced, see `Solver.use`."""
@@ -508,15 +516,21 @@ class Sweep:
         first, *sets = sets
         phi, total = self._irradiance_of_collisions(level, first, channels, len(sets)), mi.Float(0)
         used, share = mi.Float(0), dr.opaque(mi.Float, 1 / len(sets))
+        scatters = self._boundary is not None and not self.cache.moments and len(sets) > 2
+        squares = mi.Float(0)
         for number, each in enumerate(sets, 1):
             irradiance, again = each.sweep(level, phi)
             total, used = total + irradiance, used + phi
-            dr.eval(total, used)
+            if scatters:
+                squares += dr.square(irradiance)
+            dr.eval(total, used, squares)
             if self.cache.max_depth < 0:
                 # The sweep is another estimate of all orders: the mean of both has less noise.
                 again = each.corrected(level, phi, self._add_sampled(again, channels))
                 phi = dr.lerp(phi, again, dr.opaque(mi.Float, 1 / (number + 1)))
                 dr.eval(phi)
+        if scatters:
+            self._note_noise(total, squares, len(sets), channels)
         if self.cache.max_depth >= 0:
             return total * share
         # Earlier passes used a noisier phi than the final one. Without this correction the noise of
@@ -528,6 +542,20 @@ class Sweep:
         else:  # coarser levels have no surfaces among the voxels
             change, _ = sets[0].exchanged(level, change)
         return dr.fma(total, share, change)
+
+    def _note_noise(
+        self, total: mi.Float, squares: mi.Float, passes: int, channels: tuple[int, ...]
+    ) -> None:
+        """Estimate the noise of a batch by the scatter of its passes, given their sum and the sum
+        of their squares.
+        """
+        count = dr.opaque(mi.Float, passes)
+        variance = dr.maximum(squares - dr.square(total) / count, 0) / (count * (count - 1))
+        sampled = sum(dr.mean(sum(self._sampled(c), mi.Float(0))) for c in channels)
+        values = dr.mean(variance), dr.mean(total) / count, sampled / len(channels)
+        dr.eval(values)
+        variance, mean, sampled = (float(v[0]) for v in values)
+        self._squared_noise.append(variance / max(mean + sampled, 1e-30) ** 2)
 
     def _irradiance_of_collisions(
         self,
