@@ -1,4 +1,4 @@
-"""Ten cases for each of five classes of wrong images that tests from outside have found.
+"""Ten cases for each of six classes of wrong images that tests from outside have found.
 
 Numbers are drawn once from fixed seeds: nobody has chosen them by the results.
 """
@@ -207,6 +207,33 @@ def coarse_grids() -> dict[str, tuple[Objects, int]]:
         matter = _matter(values, depth, float(random.uniform(0.5, 0.99)), edges)
         place = identity().scale(list(map(float, edges)))
         found[name] = {"box": bounded(matter, place=place)} | _light(light), orders
+    return found
+
+
+def cutting_objects() -> dict[str, tuple[Objects, int]]:
+    """Return homogeneous media whose faces are cut by one to three objects at odd angles."""
+    random = np.random.default_rng(841)
+    found = {}
+    for i in range(10):
+        objects: Objects = {}
+        for k in range(1 + i % 3):
+            kind = ("cube", "rectangle", "sphere", "disk", "cylinder")[int(random.integers(5))]
+            center = random.uniform(-0.9, 0.9, 3)
+            center[int(random.integers(3))] = random.choice([-1, 1]) * random.uniform(0.75, 1.05)
+            place = identity().translate(center.tolist())
+            place = place.rotate(random.normal(size=3).tolist(), float(random.uniform(0, 90)))
+            sizes = random.uniform(0.15, 0.6, 3)
+            sizes = np.full(3, sizes[0]) if kind in ("sphere", "cylinder") else sizes
+            sheet = {"type": "twosided", "bsdf": DIFFUSE}
+            place = place.scale(sizes.tolist())
+            objects[f"object{k}"] = {"type": kind, "to_world": place, "bsdf": sheet}
+        depth = float(np.exp(random.uniform(np.log(0.5), np.log(12))))
+        albedo = float(random.choice([0.3, 0.8, 0.97]))
+        light, orders = ("sun", "sky", "point", "side")[i % 4], -1 if i % 3 else 2
+        kinds = ", ".join(each["type"] for each in objects.values())
+        name = f"{kinds} in depth {depth:.1f}, albedo {albedo:.2g}, {light}, {_orders(orders)}"
+        box = bounded(fog(depth / 2, albedo))
+        found[name] = {"box": box} | objects | _light(light), orders
     return found
 
 
