@@ -372,7 +372,7 @@ def _root_field(
         channels = channels[:1]
     separated, count = None if classes is None else classes.separated, len(channels)
     field = RootField(grid, spread(grid, voxels, channels, classes), count, separated=separated)
-    field.data = dr.minimum(field.data, 1)
+    field.data = dr.minimum(field.data, 1)  # it is a transmittance, also where extrapolated
     return field
 
 

@@ -57,9 +57,9 @@ from mitsuba_irrcache.solvers.half_space import HalfSpace
 #: Relative variance of voxels above which a warning is logged: images around a flame that few
 #: directions meet are 2 to 4 % too dark with 0.2, and 40 % with 0.7.
 LARGE_VARIANCE = 0.15
-#: The same for voxels around a sensor within the medium, weighted by what it receives from them:
-#: haze in which nearly all radiance is absorbed or scattered before it arrives has errors of 2 to
-#: 5 % with 0.1, and 4 to 15 % with 0.3.
+#: The same for voxels around a sensor within the medium, weighted by the radiance that it receives
+#: from them: images from within haze of ten mean free paths have errors of 2 to 5 % with 0.1, and 4
+#: to 15 % with 0.3.
 LARGE_VARIANCE_AROUND_SENSOR = 0.06
 #: Noise of directions that voxels share, above which a warning is logged. It is 1 to 1.5 % in most
 #: scenes with surfaces; with 2.5 to 4 %, means of images are off by 3 % and parts of them by 12 %.
