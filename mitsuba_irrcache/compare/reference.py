@@ -13,10 +13,10 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
+from mitsuba_irrcache.core.clear_channels import warn_of_clear_channel
 from mitsuba_irrcache.errors import IrrcacheError, reason
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.io.scene_files import load_scene, loses_emission, parse_integrator
-from mitsuba_irrcache.pipeline.defaults import warn_of_clear_channel
 
 from .scene_files import scene_digest
 

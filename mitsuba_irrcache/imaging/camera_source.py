@@ -8,13 +8,13 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
+from mitsuba_irrcache.core.clear_channels import medium_with_clear_channel, warn_of_clear_channel
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.imaging.options import Options
 from mitsuba_irrcache.imaging.stock import StockIntegrators
 from mitsuba_irrcache.imaging.stock_estimate import StockImage, cheaper_stock_image
 from mitsuba_irrcache.pipeline.builder import Progress
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
-from mitsuba_irrcache.pipeline.defaults import medium_with_clear_channel, warn_of_clear_channel
 from mitsuba_irrcache.render.camera import CameraRays, ClosedFormCameraRays, TracedCameraRays
 from mitsuba_irrcache.render.certificate import Certificate
 from mitsuba_irrcache.scene.consistency import check_sensor

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.bounds import bounds_of_shapes
+from mitsuba_irrcache.core.clear_channels import extinction_by_channel
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.compile import media_of
@@ -31,48 +30,10 @@ def choose_stock(scene: mi.Scene) -> tuple[str, str]:
     media = {*media_of(scene)}
     if not media:
         return "volpath", "there is no medium"
-    ratio = max(_chromaticity(_channel_sums(scene, medium)) for medium in media)
+    ratio = max(_chromaticity(extinction_by_channel(scene, medium)) for medium in media)
     if ratio > CHROMATIC:
         return "volpathmis", f"extinction differs between the channels, 1 : {ratio:.2g}"
     return "volpath", "extinction is about the same in all channels"
-
-
-def medium_with_clear_channel(scene: mi.Scene) -> str | None:
-    """Return the name of a medium whose extinction is 0 in some channels only; None without any.
-
-    ``volpath`` and ``volpathmis`` sample the distance to a collision for one channel at random. In
-    such a channel there is none, so that a part of the radiance that others scatter is lost.
-    """
-    for medium in {*media_of(scene)}:
-        sums = _channel_sums(scene, medium)
-        if sums.max() > 0 and sums.min() == 0:
-            return medium.id()
-    return None
-
-
-def warn_of_clear_channel(scene: mi.Scene, integrator: str) -> None:
-    """Log a warning if an ``integrator`` of Mitsuba loses radiance, see
-    `medium_with_clear_channel`.
-    """
-    name = medium_with_clear_channel(scene)
-    if name is not None:
-        mi.Log(
-            mi.LogLevel.Warn,
-            f'irrcache: the extinction of medium "{name}" is 0 in some channels only. '
-            f'"{integrator}" renders such media too dark, because no collisions are sampled in '
-            "those channels; set them to a thousandth of the others instead.",
-        )
-
-
-def _channel_sums(scene: mi.Scene, medium: mi.Medium) -> np.ndarray:
-    """Return the extinction of a medium in each channel, summed over random positions."""
-    rng = mi.PCG32(4096)
-    lower, upper = (mi.Point3f(*map(float, end)) for end in bounds_of_shapes(scene))
-    at = dr.zeros(mi.MediumInteraction3f, 4096)
-    u = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-    at.p = lower + u * (upper - lower)
-    sigma_t = np.array(medium.get_scattering_coefficients(at, True)[2], dtype=np.float64)
-    return sigma_t.reshape(dr.size_v(mi.Spectrum), -1).sum(axis=1)
 
 
 def _chromaticity(sums: np.ndarray) -> float:

@@ -114,6 +114,8 @@ class Sweep:
     ) -> None:
         """``rr_depth`` applies to paths between surfaces; ``pause`` is called after each launch."""
         self.cache, self.seed = cache, seed
+        #: squared noise of each batch, see `direction_noise`
+        self._squared_noise: list[float] = []
         sampling = FEW_SAMPLES, True
         if medium.is_isolated:
             sampling = samples_in_isolated_media(cache.max_depth, not cache.moments)
@@ -160,8 +162,6 @@ class Sweep:
         self._colour = np.ones(cache.channels)
         self._boundary: SurfaceBoundary | None = None
         self._emitter_sampling: EmitterSampling | None = None
-        #: squared noise of each batch, see `direction_noise`
-        self._squared_noise: list[float] = []
         #: irradiance from each point-like emitter, among surfaces
         self._from_points: list[mi.Spectrum] = []
         if medium.is_isolated:
