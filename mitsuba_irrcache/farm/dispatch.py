@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import queue
+import signal
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from statistics import median
+from threading import current_thread, main_thread
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
@@ -52,6 +55,28 @@ class _Attempt:
     started: float = field(default_factory=time.monotonic)
 
 
+@contextmanager
+def _interrupt_put_into(answers: queue.SimpleQueue) -> Iterator[None]:
+    """Put None into a queue at the first interrupt by the user, instead of raising
+    KeyboardInterrupt, which would be lost if Python happens to run a destructor. A second one is
+    raised.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.default_int_handler or current_thread() is not main_thread():
+        yield
+        return
+
+    def handle(*_: object) -> None:
+        signal.signal(signal.SIGINT, before)
+        answers.put(None)
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 class Dispatch:
     """The jobs of one run. ``store`` is called with each finished job, once, in this thread."""
 
@@ -68,7 +93,8 @@ class Dispatch:
         self._open = {job.name: job for job in jobs}
         self._total, self._run = len(jobs), uuid4().hex[:8]
         self._attempts: dict[str, _Attempt] = {}  # by key of the future
-        self._answered: queue.Queue[str] = queue.Queue()
+        #: keys of finished futures; None: the user has interrupted the command
+        self._answered: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._counts: dict[str, Counter] = {"error": Counter(), "killed": Counter()}
         self._durations: list[float] = []
         self._failures = 0
@@ -92,15 +118,19 @@ class Dispatch:
             return {}
         started = time.monotonic()
         try:
-            for address, reason in unfit_workers(self._client).items():
-                self._exclude(address, reason)
-            while self._open:
-                self._look()
-                self._submit_more()
-                try:
-                    self._take(self._answered.get(timeout=INTERVAL))
-                except queue.Empty:
-                    continue
+            with _interrupt_put_into(self._answered):
+                for address, reason in unfit_workers(self._client).items():
+                    self._exclude(address, reason)
+                while self._open:
+                    self._look()
+                    self._submit_more()
+                    try:
+                        key = self._answered.get(timeout=INTERVAL)
+                    except queue.Empty:
+                        continue
+                    if key is None:
+                        raise KeyboardInterrupt
+                    self._take(key)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"{self._progress}; --resume continues") from None
         finally:
