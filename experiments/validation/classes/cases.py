@@ -221,7 +221,9 @@ def cutting_objects() -> dict[str, tuple[Objects, int]]:
             center = random.uniform(-0.9, 0.9, 3)
             center[int(random.integers(3))] = random.choice([-1, 1]) * random.uniform(0.75, 1.05)
             place = identity().translate(center.tolist())
-            place = place.rotate(random.normal(size=3).tolist(), float(random.uniform(0, 90)))
+            axis = random.normal(size=3)
+            axis = (axis / np.linalg.norm(axis)).tolist()  # Mitsuba would shear with a longer one
+            place = place.rotate(axis, float(random.uniform(0, 90)))
             sizes = random.uniform(0.15, 0.6, 3)
             sizes = np.full(3, sizes[0]) if kind in ("sphere", "cylinder") else sizes
             sheet = {"type": "twosided", "bsdf": DIFFUSE}
