@@ -137,9 +137,10 @@ def run(args: argparse.Namespace) -> int:
     with _stopwatch(seconds, "load"), display.stage(f"loading {source.name}"):
         parameters = parse_parameters(args.define)
         integrator = chosen_integrator(source, parameters, args.integrator)
+        used = integrator or integrator_of(source, parameters)
         properties = {}
         if args.tolerance:
-            _check_tolerance(integrator or integrator_of(source, parameters), args)
+            _check_tolerance(used, args)
             properties["tolerance"] = args.tolerance
         scene = load_scene(source, parameters, integrator, properties)
     if not 0 <= args.sensor < len(scene.sensors()):
@@ -147,16 +148,15 @@ def run(args: argparse.Namespace) -> int:
             f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), "
             "counted from 0."
         )
-    if integrator is None and integrator_of(source, parameters) != "irrcache":
-        name = integrator_of(source, parameters)
+    if integrator is None and used != "irrcache":
         print(
-            f'irrcache: the scene\'s own integrator "{name}" renders the image; '
+            f'irrcache: the scene\'s own integrator "{used}" renders the image; '
             "-i irrcache replaces it.",
             file=sys.stderr,
         )
     _check_background(scene, args)
     if args.budget or args.error:
-        _require_progressive(scene, integrator or integrator_of(source, parameters))
+        _require_progressive(scene, used)
         _render_progressive(scene, args, seconds, output, display)
     else:
         image = _render(scene, args, seconds, display)
