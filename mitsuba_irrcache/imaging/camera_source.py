@@ -156,12 +156,14 @@ class CameraRaySource:
             parts = builder.parts
             if not parts or builder.carries_gradients or not builder.is_untouched:
                 return None
-            if medium_with_clear_channel(scene) is not None:
-                return None
             stock.choose(scene)
             spent = self._without_caches[1] if self._without_caches[0] is parts else 0.0
             spp = spp or sensor.sampler().sample_count()
-            return cheaper_stock_image(scene, sensor, spp, parts, stock.chosen, spent)
+            image = cheaper_stock_image(scene, sensor, spp, parts, stock.chosen, spent)
+            # Few images are cheaper, so that only few scenes are searched for such a medium.
+            if image is not None and medium_with_clear_channel(scene) is not None:
+                return None
+            return image
 
     def note_stock_image(self, image: StockImage) -> None:
         """Log that ``image`` is rendered without caches, and count its paths: after some such

@@ -354,6 +354,11 @@ class MultigridLevel:
         """Run a multigrid cycle: a step of source iteration, and the coarse-grid correction."""
         return self.coarse_corrected(phi, self.collisions(phi, tables[0]) + b, tables[1:])
 
+    def corrected_along(self, ordinates: Ordinates, phi: mi.Float, swept: mi.Float) -> mi.Float:
+        """Apply `coarse_corrected` to ``swept``, the result of a sweep along ``ordinates``."""
+        coarse = [] if self.coarsest else self.coarser.tables(ordinates)
+        return self.coarse_corrected(phi, swept, coarse)
+
     def coarse_corrected(
         self, phi: mi.Float, swept: mi.Float, coarse: list[TrackTable]
     ) -> mi.Float:

@@ -91,9 +91,8 @@ class OrdinateSet:
         return level.solve(b, self.scattering, tolerance=max(1.0, passes / 2))
 
     def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
-        """Apply `MultigridLevel.coarse_corrected` to a sweep along the ordinates of this set."""
-        coarse = [] if level.coarsest else level.coarser.tables(self.scattering)
-        return level.coarse_corrected(phi, swept, coarse)
+        """Apply `MultigridLevel.corrected_along` to a sweep along the ordinates of this set."""
+        return level.corrected_along(self.scattering, phi, swept)
 
     @property
     def scattering(self) -> Ordinates:
@@ -179,15 +178,15 @@ class BoundaryOrdinateSet:
         return table
 
     def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
-        """Apply `MultigridLevel.coarse_corrected` to a sweep along the ordinates of this set.
+        """Apply `MultigridLevel.corrected_along` to a sweep along the ordinates of this set.
 
         It is omitted with surfaces among the voxels, through which coarse corrections would leak.
 
         In dense media the result would otherwise depend on the ordinates of the first set alone.
         """
-        if self.incoming.crossings is not None or level.coarsest:
+        if self.incoming.crossings is not None:
             return swept
-        return level.coarse_corrected(phi, swept, level.coarser.tables(self.scattering))
+        return level.corrected_along(self.scattering, phi, swept)
 
     def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
         """Solve for all orders, given the uncollided ``b``; radiance may leave the medium and
