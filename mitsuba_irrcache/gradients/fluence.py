@@ -100,23 +100,8 @@ class FluenceFields:
         return fields
 
     def _cached(self, channel: int) -> Components:
-        """Return the values of a channel of the cache at all voxels, 0 at inactive ones.
-
-        These are the irradiance, its moments, and the irradiance of each narrow source of the
-        cache.
-        """
-        cache = self._cache
-        place = dr.arange(mi.UInt32, cache.grid.voxel_count) * cache.channels + channel
-        irradiance = dr.gather(mi.Float, cache.irradiance.array, place)
-        components = [irradiance]
-        if cache.directional is not None:
-            for values in cache.moment_means()[channel :: cache.channels]:
-                spread = dr.zeros(mi.Float, cache.grid.voxel_count)
-                if cache.active_count:
-                    dr.scatter(spread, values, cache.active)
-                components.append(spread)
-            dr.eval(components)
-        return [self._scaled(values, channel) for values in components]
+        """Return `cached_components` of a channel divided by the factor of its colour."""
+        return [self._scaled(values, channel) for values in cached_components(self._cache, channel)]
 
     def _scaled(self, values: mi.Float, channel: int) -> mi.Float:
         """Return ``values`` of a channel divided by the factor of its colour."""
@@ -159,3 +144,20 @@ class FluenceFields:
             number = next(i for i, (source, _) in enumerate(sources) if source.is_same(own))
             result.append(sources.pop(number)[1])
         return result
+
+
+def cached_components(cache: IrradianceCache, channel: int) -> Components:
+    """Return the values of a channel of ``cache`` at all voxels, 0 at inactive ones.
+
+    These are the irradiance, its moments, and the irradiance of each narrow source of the cache.
+    """
+    place = dr.arange(mi.UInt32, cache.grid.voxel_count) * cache.channels + channel
+    components = [dr.gather(mi.Float, cache.irradiance.array, place)]
+    if cache.directional is not None:
+        for values in cache.moment_means()[channel :: cache.channels]:
+            spread = dr.zeros(mi.Float, cache.grid.voxel_count)
+            if cache.active_count:
+                dr.scatter(spread, values, cache.active)
+            components.append(spread)
+        dr.eval(components)
+    return components

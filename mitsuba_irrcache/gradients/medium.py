@@ -62,6 +62,19 @@ def field_of(medium: MediumGrid, role: str) -> Field:
     return medium.sigma_t if role == SIGMA_T else medium.albedo
 
 
+def sums_for(medium: MediumGrid, wanted: dict[str, int]) -> dict[str, int]:
+    """Return the number of channels of the derivatives to sum, by role.
+
+    With delta-M scaling, the ``wanted`` derivative with respect to the albedo follows from those
+    with respect to both the scaled extinction and the scaled albedo.
+    """
+    if medium.original is None or wanted.keys() <= {EMISSION}:
+        return dict(wanted)
+    channels = max(medium.channels, *wanted.values())
+    roles = (SIGMA_T, ALBEDO) if wanted.keys() & {ALBEDO, MEAN_COSINE} else (SIGMA_T,)
+    return wanted | dict.fromkeys(roles, channels)
+
+
 class MediumAdjoint:
     """Derivatives of an objective with respect to the medium of ``part`` in ``scene``.
 
@@ -92,8 +105,8 @@ class MediumAdjoint:
         #: emitters with respect to whose position or direction there are derivatives
         self.placements: list[Placement] = []
         self.transport: AdjointTransport | None = None
-        #: number of channels of the sums for each role, see `_sums_for`
-        self._sums = self._sums_for(wanted)
+        #: number of channels of the sums for each role
+        self._sums = sums_for(part.medium, wanted)
         self.fluence: FluenceFields | None = None
         #: for derivatives with respect to the mean cosine
         self.phases: NeighbouringPhases | None = None
@@ -119,18 +132,6 @@ class MediumAdjoint:
             ]
             neighbours = (*marches, self.phases.step)
         self.march = CameraReplay(self.medium, self.fluence, colour, step, neighbours)
-
-    def _sums_for(self, wanted: dict[str, int]) -> dict[str, int]:
-        """Return the number of channels of the derivatives to sum, by role.
-
-        With delta-M scaling, the ``wanted`` derivative with respect to the albedo follows from
-        those with respect to both the scaled extinction and the scaled albedo.
-        """
-        if self.medium.original is None or wanted.keys() <= {EMISSION}:
-            return dict(wanted)
-        channels = max(self.medium.channels, *wanted.values())
-        roles = (SIGMA_T, ALBEDO) if wanted.keys() & {ALBEDO, MEAN_COSINE} else (SIGMA_T,)
-        return wanted | dict.fromkeys(roles, channels)
 
     def _new_transport(self, seed: int, channels_apart: bool) -> AdjointTransport:
         settings, wanted = self._part.settings, self._wanted

@@ -9,7 +9,7 @@ Speierer and Jakob 2021).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -45,15 +45,19 @@ class Start:
         alpha: derivative with respect to what the rays see if they leave the scene: -1 times that
             with respect to alpha; None without.
         adjoint_of_irradiance: derivative with respect to the irradiance of emitters at the origin
-            of the rays, which isotropic scattering there adds; None for rays of a camera.
+            of the rays, which is scattered there, as a function of the direction to the emitter;
+            None for rays of a camera.
         rng: random number generator.
+        adjoint_of_emitters: derivative with respect to the radiance of emitters that the rays hit;
+            None if it is ``adjoint``.
     """
 
     ray: mi.Ray3f
     adjoint: mi.Spectrum
     alpha: mi.Float | None
-    adjoint_of_irradiance: mi.Spectrum | None
+    adjoint_of_irradiance: Callable[[mi.Vector3f], mi.Spectrum] | None
     rng: mi.PCG32
+    adjoint_of_emitters: mi.Spectrum | None = None
 
 
 @dataclass
@@ -68,6 +72,7 @@ class _Segment:
         scattered, before: for each medium, the radiance that it scatters into the rays, and the
             transmittance of what is in front of it.
         through: transmittance of all media.
+        marches: of the media, without scattering where a path may not be longer.
         end: the surface at the end.
         emitted: weighted radiance of emitters that the ray hits; ``emitter_weight`` its weight.
     """
@@ -82,6 +87,7 @@ class _Segment:
     scattered: list[mi.Spectrum]
     before: list[mi.Spectrum]
     through: mi.Spectrum
+    marches: list[CameraReplay]
     end: mi.SurfaceInteraction3f
     emitted: mi.Spectrum
     emitter_weight: mi.Spectrum
@@ -136,6 +142,16 @@ class MarchedMedia:
     def __init__(self, marches: Sequence[CameraReplay]) -> None:
         self.marches = list(marches)
 
+    def without_peak(self) -> MarchedMedia:
+        """Return the media for rays into which their forward peaks scatter no radiance of narrow
+        sources, because that counts as unscattered (`media/delta_m`).
+        """
+        return MarchedMedia([march.without_peak() for march in self.marches])
+
+    def without_scattering(self) -> MarchedMedia:
+        """Return the media as they attenuate radiance, without what they scatter."""
+        return MarchedMedia([march.without_scattering() for march in self.marches])
+
     def spans(self, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool) -> tuple[list, list, list]:
         """Return where rays of a length are in each medium, and whether they are."""
         nears, fars, hits = [], [], []
@@ -186,7 +202,8 @@ class PathAdjoint:
 
     ``emitters`` and ``surfaces`` state whether derivatives with respect to the radiance of emitters
     and to BSDFs are added to the gradients of their parameters; ``hide_emitters`` is the
-    integrator's property.
+    integrator's property; ``events`` is the number of scattering events along a path at most, None
+    without a limit.
     """
 
     def __init__(
@@ -196,9 +213,13 @@ class PathAdjoint:
         emitters: bool = False,
         surfaces: bool = False,
         hide_emitters: bool = False,
+        events: int | None = None,
     ) -> None:
         self._scene, self._media, self._hides = scene, media, hide_emitters
-        self._emitters, self._surfaces = emitters, surfaces
+        self._emitters, self._surfaces, self._events = emitters, surfaces, events
+        self._attenuating = None if events is None else media.without_scattering()
+        #: the media for all rays but those of the camera
+        self._indirect = media.without_peak()
         self._segments: list[_Segment] = []
         self._vertices: list[_Vertex | None] = []
 
@@ -222,9 +243,18 @@ class PathAdjoint:
             offset = 1 - rng.next_float32()
             arrival = origin, density, is_seen
             alpha = start.alpha if number == 0 else None
-            segment = self._segment(ray, weight, arrival, offset, active, alpha)
+            is_last = number == self._events
+            is_camera_ray = number == 0 and start.adjoint_of_irradiance is None
+            media = self._media if is_camera_ray else self._indirect
+            media = self._attenuating if is_last else media
+            of_emitters = start.adjoint_of_emitters if number == 0 else None
+            weights = weight, weight if of_emitters is None else of_emitters
+            segment = self._segment(ray, weights, arrival, offset, active, alpha, media)
             self._segments.append(segment)
             total += segment.gathered() + segment.emitted + segment.escaped
+            if is_last:
+                self._vertices.append(None)
+                break
             active = active & segment.end.is_valid()
             vertex, ray, weight, (origin, density, is_seen), active, rng = self._scatter(
                 segment, number, arrival, active, rng
@@ -237,13 +267,16 @@ class PathAdjoint:
         return total
 
     def _start_in_voxel(
-        self, origin: mi.Interaction3f, irradiance: mi.Spectrum, rng: mi.PCG32
+        self,
+        origin: mi.Interaction3f,
+        adjoint: Callable[[mi.Vector3f], mi.Spectrum],
+        rng: mi.PCG32,
     ) -> tuple[_Vertex, mi.PCG32]:
         sample = mi.Point2f(rng.next_float32(), rng.next_float32())
         record, emitter, shadow, visible = self._emitter(origin, sample, mi.Bool(True))
         other = dr.select(record.delta, 0, UNIFORM)
         share = power_heuristic_or_one(record, other)
-        scale = irradiance * (visible * share)
+        scale = adjoint(record.d) * (visible * share)
         vertex = _Vertex(
             shadow, distance_to(record), scale * emitter, record, scale, origin, None, record.d,
             mi.Spectrum(1), mi.Bool(True),
@@ -272,24 +305,29 @@ class PathAdjoint:
     def _segment(
         self,
         ray: mi.Ray3f,
-        weight: mi.Spectrum,
+        weights: tuple[mi.Spectrum, mi.Spectrum],
         arrival: tuple,
         offset: mi.Float,
         active: mi.Bool,
         alpha: mi.Float | None,
+        media: MarchedMedia,
     ) -> _Segment:
-        origin, density, is_seen = arrival
+        """Follow rays to the next surface.
+
+        ``weights`` are those of scattered radiance and of the radiance of emitters.
+        """
+        (weight, of_emitters), (origin, density, is_seen) = weights, arrival
         hides = is_seen if self._hides else mi.Bool(False)
         end, distance = next_solid(self._scene, ray, active, hides)
         spans = self._media.spans(ray, distance, active)
         dr.eval(end, distance, spans)
-        scattered, before, through = self._media.march(ray, spans, offset)
+        scattered, before, through = media.march(ray, spans, offset)
         emitter = end.emitter(self._scene, active)
         record = mi.DirectionSample3f(self._scene, end, origin)
         other = self._scene.pdf_emitter_direction(origin, record, active & ~is_seen)
         share = dr.select(density > 0, power_heuristic(density, other), 1)
         share = dr.select(hides, 0, share)
-        emitter_weight = dr.select(active, weight * through * share, 0)
+        emitter_weight = dr.select(active, of_emitters * through * share, 0)
         emitted = emitter_weight * emitter.eval(end, active)
         escaped = mi.Spectrum(0)
         if alpha is not None:
@@ -297,8 +335,8 @@ class PathAdjoint:
             escaped = dr.select(away, through * (alpha / dr.size_v(mi.Spectrum)), 0)
         dr.eval(emitted, emitter_weight, escaped)
         return _Segment(
-            ray, distance, offset, weight, *spans, scattered, before, through, end, emitted,
-            emitter_weight, escaped,
+            ray, distance, offset, weight, *spans, scattered, before, through, media.marches, end,
+            emitted, emitter_weight, escaped,
         )  # fmt: skip
 
     def _scatter(
@@ -349,6 +387,17 @@ class PathAdjoint:
         dr.eval(vertex.direct, vertex.emitter_weight, vertex.shadow, vertex.scattering)
         return vertex, ray, weight, (origin, density, is_seen), active, rng
 
+    def contributions(self) -> list[tuple[mi.Vector3f, mi.Spectrum, mi.Spectrum]]:
+        """Return the weighted radiance that is incident at starts in voxels: directions, and what
+        comes from there straight from emitters and scattered.
+        """
+        (vertex, *vertices), (first, *segments) = self._vertices, self._segments
+        rest = first.gathered() + first.escaped
+        rest += sum((s.gathered() + s.emitted for s in segments), mi.Spectrum(0))
+        rest += sum((v.direct for v in vertices if v is not None), mi.Spectrum(0))
+        none = mi.Spectrum(0)
+        return [(vertex.record.d, vertex.direct, none), (first.ray.d, first.emitted, rest)]
+
     def largest(self) -> float:
         """Return an upper bound of the weighted radiance that any part of a path has ahead."""
         total = mi.Spectrum(0)
@@ -368,8 +417,9 @@ class PathAdjoint:
         rest = mi.Spectrum(0)
         for number in range(len(self._segments) - 1, -1, -1):
             segment, vertex = self._segments[number], self._vertices[number + 1]
-            self._add_vertex(vertex, rest, splats)
-            rest = rest + vertex.direct
+            if vertex is not None:
+                self._add_vertex(vertex, rest, splats)
+                rest = rest + vertex.direct
             skipped = without_first if number == 0 else None
             self._add_segment(segment, rest, splats, skipped)
             rest = rest + segment.gathered() + segment.emitted + segment.escaped
@@ -385,14 +435,17 @@ class PathAdjoint:
         skipped: int | None,
     ) -> None:
         behind = rest + segment.emitted + segment.escaped
-        for number, march in enumerate(self._media.marches):
+        for number, march in enumerate(segment.marches):
             if number == skipped:
                 continue
             passed = segment.weight * segment.before[number]
             near, far, hit = segment.near[number], segment.far[number], segment.hit[number]
             rays = RaySegments(segment.ray, near, far, passed, segment.offset, hit)
             ahead = segment.behind(number) + behind
-            march.replay(rays, ahead, mi.Spectrum(0), splats[number])
+            own = splats[number]
+            if march.irradiance is None:  # nothing is scattered, so nothing collides for the path
+                own = CameraSplats(own.sigma_t, None, None)
+            march.replay(rays, ahead, mi.Spectrum(0), own)
         dr.eval()
         if self._emitters:
             with dr.resume_grad():

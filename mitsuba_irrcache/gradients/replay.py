@@ -9,6 +9,7 @@ Jakob 2021), this needs no memory per step.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import NamedTuple, Protocol
 
 import drjit as dr
@@ -84,15 +85,20 @@ class InScattering:
     """Anisotropic scattering into camera rays.
 
     ``field`` evaluates the factor by which scattering into a direction differs from isotropic
-    scattering; ``basis`` has all narrow sources of the scene.
+    scattering; ``basis`` has all narrow sources of the scene. Without ``with_peak`` a truncated
+    forward peak scatters no radiance of narrow sources.
     """
 
-    def __init__(self, field: AngularField, basis: AngularBasis) -> None:
-        self._field, self._basis = field, basis
+    def __init__(self, field: AngularField, basis: AngularBasis, with_peak: bool = True) -> None:
+        self._field, self._basis, self._with_peak = field, basis, with_peak
 
     def in_basis(self, basis: AngularBasis) -> InScattering:
         """Return the scattering by another phase function, that of ``basis``."""
-        return InScattering(self._field.in_basis(basis), self._basis)
+        return InScattering(self._field.in_basis(basis), self._basis, self._with_peak)
+
+    def without_peak(self) -> InScattering:
+        """Return the scattering without the forward peak."""
+        return InScattering(self._field, self._basis, with_peak=False)
 
     def view(self, direction: mi.Vector3f) -> tuple:
         """Evaluate what depends on the ``direction`` of rays only; an argument of other methods."""
@@ -102,7 +108,7 @@ class InScattering:
     def factor(self, p: mi.Point3f, view: tuple, active: mi.Bool) -> mi.Float | mi.Color3f:
         """Return the factor of the irradiance at ``p``, see `AngularField.factor`."""
         direction, basis, _ = view
-        return self._field.factor(p, direction, basis, active)
+        return self._field.factor(p, direction, basis, active, self._with_peak)
 
     def importance(self, p: mi.Point3f, view: tuple, active: mi.Bool) -> list[mi.Float]:
         """Return the components of the importance of rays at ``p``.
@@ -112,7 +118,7 @@ class InScattering:
         """
         # docs/primer, eq. (8.12)
         direction, _, moments = view
-        gains = [1 + gain for gain in self._basis.gains(p, direction, active)]
+        gains = [1 + g for g in self._basis.gains(p, direction, active, self._with_peak)]
         return [mi.Float(1), *moments, *gains]
 
 
@@ -159,6 +165,21 @@ class CameraReplay:
         edges = [f.grid.voxel_size.min() for f in fields if f is not None and f.grid is not None]
         length = min(edges, default=float(max(abs(medium.frame[:3, :3]).max(), 1e-30) / 64))
         self.step = dr.opaque(mi.Float, float(length) * step)
+
+    def without_scattering(self) -> CameraReplay:
+        """Return a march with the same steps along which the medium scatters nothing."""
+        march = copy(self)
+        march.irradiance = march._falloff = march._angular = march._neighbours = None
+        march._direct_lights = []
+        return march
+
+    def without_peak(self) -> CameraReplay:
+        """Return the march of rays that no truncated forward peak scatters into."""
+        if not self.medium.phase.forward:
+            return self
+        march = copy(self)
+        march._angular = self._angular.without_peak()
+        return march
 
     def sigma_t(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
         return mi.Spectrum(self.medium.sigma_t.at_world(p, active))

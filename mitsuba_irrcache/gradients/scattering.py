@@ -93,8 +93,10 @@ class IsotropicScattering:
 
     #: numbers of components of the fluence, and of the adjoint fluence of camera rays
     count = camera_count = 1
-    #: the basis of the components
-    moments = OneMoment()
+    #: the basis of the components; narrow sources
+    moments, sources = OneMoment(), ()
+    #: the basis of the fluence; None for a single component
+    basis: AngularBasis | None = None
     #: whether channels of the same extinction are swept together
     joins_channels = True
     #: number of pairs of ordinates with which the adjoint equation is solved
@@ -169,6 +171,10 @@ class IsotropicScattering:
         """Return the factors of the products of components of which `product` is the sum."""
         return [dr.inv_four_pi]
 
+    def norms(self) -> list[float]:
+        """Return the root mean square over directions of the basis of each component."""
+        return [1.0]
+
     def isotropic(self, radiance: mi.Float) -> Components:
         """Return the components of a ``radiance`` that is the same in all directions."""
         return [radiance]
@@ -198,7 +204,7 @@ class AnisotropicScattering(IsotropicScattering):
     joins_channels = False
 
     def __init__(self, basis: AngularBasis) -> None:
-        self.basis, self.moments = basis, Moments(basis)
+        self.basis, self.moments, self.sources = basis, Moments(basis), tuple(basis.sources)
         self.count = self.moments.count
         self.camera_count = self.count + len(basis.sources)
         self.solving_pairs = directions_of(basis.order) // 2
@@ -242,8 +248,13 @@ class AnisotropicScattering(IsotropicScattering):
     def of_parts(self, camera: Components, travelled: Components) -> list[Components]:
         smooth = [a + b for a, b in zip(travelled, camera, strict=False)]
         # Radiance of a narrow source is scattered into camera rays by the exact phase function, and
-        # between voxels by the moments.
-        exact = [[travelled[0] + own, *travelled[1:]] for own in camera[self.count :]]
+        # between voxels by the moments. Those of wide sources are part of the moments for camera
+        # rays, too, which the exact phase function exceeds.
+        pairs = zip(camera[self.count :], self.sources, strict=True)
+        exact = [
+            [travelled[0] + own, *(travelled if source.sharp else smooth)[1:]]
+            for own, source in pairs
+        ]
         return [smooth, *exact]
 
     def scattered(self, components: Components, scale: mi.Float) -> Components:
@@ -277,6 +288,9 @@ class AnisotropicScattering(IsotropicScattering):
             dr.opaque(mi.Float, (-1) ** n * float(moments[n]) / (1 if n else 4 * np.pi))
             for n in self.moments.degrees
         ]
+
+    def norms(self) -> list[float]:
+        return [float(np.sqrt(1 / (4 * np.pi))) if n else 1.0 for n in self.moments.degrees]
 
     def isotropic(self, radiance: mi.Float) -> Components:
         none = dr.zeros(mi.Float, dr.width(radiance))

@@ -11,11 +11,10 @@ import numpy as np
 
 from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.gradients.beams import check_beams
+from mitsuba_irrcache.gradients.coupled_medium import CoupledMedium
 from mitsuba_irrcache.gradients.film import FilmAdjoint
-from mitsuba_irrcache.gradients.medium import field_of
+from mitsuba_irrcache.gradients.medium import field_of, original_of
 from mitsuba_irrcache.gradients.parameters import (
-    ALBEDO,
-    SIGMA_T,
     add_user,
     by_parameter,
     channels_of,
@@ -29,9 +28,11 @@ from mitsuba_irrcache.gradients.parameters import (
     users_of,
 )
 from mitsuba_irrcache.gradients.replay import CameraSplats
-from mitsuba_irrcache.gradients.surroundings import LANES, CoupledMedium, Surroundings
-from mitsuba_irrcache.lights.emitters import POINT_LIKE
+from mitsuba_irrcache.gradients.scattering import split
+from mitsuba_irrcache.gradients.surroundings import LANES, Surroundings
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind
 from mitsuba_irrcache.lights.falloff import lies_in
+from mitsuba_irrcache.lights.narrow_sources import MAX_LAMPS
 from mitsuba_irrcache.media.bake import children
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.scene.compile import media_of
@@ -43,12 +44,12 @@ DIFFUSE, NESTING = "SmoothDiffuse", ("TwoSidedBRDF",)
 def check(parts: list[CachedMedium], keys: list[str]) -> None:
     """Raise IrrcacheError for scenes with surfaces or several media without gradients."""
     description, settings = parts[0].description, parts[0].settings
-    if settings.max_depth >= 0:
+    if settings.max_depth not in (2, -1):
         refuse_all(
             keys,
             f"max_depth is {settings.max_depth} and there are surfaces, area lights or several "
             "media",
-            "Set max_depth to -1",
+            "Set max_depth to 2 or -1",
         )
     if len(parts) < len(description.media.grids):
         refuse_all(keys, "a medium is not visible to the camera", "Remove that medium")
@@ -59,8 +60,12 @@ def check(parts: list[CachedMedium], keys: list[str]) -> None:
 def _check_medium(part: CachedMedium, keys: list[str]) -> None:
     medium, name = part.medium, f'medium "{part.medium.name}"'
     among = "among surfaces, area lights or several media"
-    if not medium.phase.is_isotropic:
-        refuse_all(keys, f"{name} scatters anisotropically {among}", "Remove its phase function")
+    lamps = part.description.emitters.of(EmitterKind.AREA)
+    if not medium.phase.is_isotropic and len(lamps) > MAX_LAMPS:
+        reason = (
+            f"{name} scatters anisotropically {among}, and there are {len(lamps)} area emitters"
+        )
+        refuse_all(keys, reason, f"Use {MAX_LAMPS} at most")
     if medium.emission is not None:
         refuse_all(keys, f"{name} is emissive {among}", "Remove the emission")
     if medium.refracts:
@@ -111,17 +116,21 @@ class TracedAdjoint:
         if film.largest == 0:
             return {}, None
         splats, fluence = self._surroundings.view(film)
-        joined = [concatenated(list(channels)) for channels in zip(*fluence, strict=True)]
+        joined = [
+            concatenated([layer for components in media for layer in components])
+            for media in zip(*fluence, strict=True)
+        ]
         return self._by_parameters(splats), joined
 
     def transport(self, fluence: list[mi.Float]) -> dict[str, object]:
         """Return the derivatives as `ParameterAdjoint.transport`."""
         media = self._surroundings.media
-        counts = [medium.grid.voxel_count for medium in media]
         camera, start = [], 0
-        for medium, count in zip(media, counts, strict=True):
+        for medium in media:
+            count = medium.grid.voxel_count * medium.components
             place = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
-            camera.append([dr.gather(mi.Float, f, place) for f in fluence[: medium.channels]])
+            own = [dr.gather(mi.Float, f, place) for f in fluence[: medium.channels]]
+            camera.append([split(values, medium.components) for values in own])
             start += count
         return self._by_parameters(self._surroundings.transported(camera))
 
@@ -139,7 +148,7 @@ class TracedAdjoint:
         for key, role in self._roles.items():
             if isinstance(role, tuple):
                 number, name = role
-                field = field_of(self._parts[number].medium, name)
+                field = field_of(original_of(self._parts[number].medium), name)
                 own = field.channels if field.grid is not None else channels_of(self._params[key])
                 wanted[number][name] = max(wanted[number].get(name, 1), own)
         media = [
@@ -151,15 +160,16 @@ class TracedAdjoint:
         return Surroundings(self._scene, media, self._hides, kinds, self._seed)
 
     def _by_parameters(self, splats: list[CameraSplats]) -> dict[str, object]:
+        media = self._surroundings.media
+        found = [medium.derivatives(own) for medium, own in zip(media, splats, strict=True)]
         result = {}
-        names = {SIGMA_T: "sigma_t", ALBEDO: "albedo"}
         for key, role in self._roles.items():
             if not isinstance(role, tuple):
                 continue  # accumulated in Dr.Jit's graph
             number, name = role
-            field, value = field_of(self._parts[number].medium, name), self._params[key]
-            found = getattr(splats[number], names[name]).values()
-            result[key] = shaped_like(value, by_parameter(value, field, found))
+            field = field_of(original_of(self._parts[number].medium), name)
+            value = self._params[key]
+            result[key] = shaped_like(value, by_parameter(value, field, found[number][name]))
         return result
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.validation.gradients.cases import SURROUNDED, Case, distant, ground
+from experiments.validation.gradients.cases import SURROUNDED, Case, distant, ground, lamp
 from experiments.validation.gradients.differences import (
     compare,
     first_key,
@@ -15,7 +17,7 @@ from experiments.validation.gradients.differences import (
     pixel_weights,
 )
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients import surroundings
+from mitsuba_irrcache.gradients import paths, surroundings, traced
 
 #: Largest relative error of directional derivatives, and the least cosine. The differences
 #: themselves have a noise of 1 to 2 % (standard deviation over seeds of the cache).
@@ -39,6 +41,12 @@ def fewer_paths(monkeypatch):
         ("two media, sky", ("sigma_t", "other.interior_medium.sigma_t")),
         pytest.param("distant object, empty voxels", ("sigma_t",), marks=pytest.mark.slow),
         pytest.param("ground, sun through a window", ("sigma_t",), marks=pytest.mark.slow),
+        pytest.param("lamp over a ground, single", ("sigma_t", "lamp"), marks=pytest.mark.slow),
+        pytest.param("hg 0.5, ground, sun", ("sigma_t", "albedo"), marks=pytest.mark.slow),
+        pytest.param("hg 0.5, lamp over a ground", ("albedo", "lamp"), marks=pytest.mark.slow),
+        pytest.param("hg 0.5, two media, sun", ("sigma_t", "albedo"), marks=pytest.mark.slow),
+        pytest.param("hg 0.5, distant object, empty voxels", ("sigma_t",), marks=pytest.mark.slow),
+        pytest.param("hg 0.85, ground, sun", ("sigma_t", "albedo"), marks=pytest.mark.slow),
     ],
 )
 def test_gradients_are_those_of_the_image(mono, name, parameters):
@@ -50,6 +58,40 @@ def test_gradients_are_those_of_the_image(mono, name, parameters):
         result = compare(scene, case, parameter, weights, gradient, PERTURBATIONS)
         assert result.error < ERROR, parameter
         assert result.cosine > COSINE, parameter
+
+
+@pytest.mark.parametrize(("max_depth", "g"), [(2, None), (2, 0.5), (-1, 0.85)])
+def test_gradients_are_those_of_the_radiance_along_paths(mono, monkeypatch, max_depth, g):
+    """The objective by the paths of the gradient themselves has little noise: the same random
+    numbers, and no interpolation on surfaces. Adjoint fluence of rays along which nothing may be
+    scattered any more made an error of 7 %.
+    """
+    found, trace = [], paths.PathAdjoint.trace
+
+    def recorded(self, start):
+        radiance = trace(self, start)
+        if start.adjoint_of_irradiance is None:  # a camera ray
+            found.append(np.array(radiance, dtype=np.float64).sum())
+        return radiance
+
+    monkeypatch.setattr(paths.PathAdjoint, "trace", recorded)
+    case = Case(data=8, cache=8, g=g, max_depth=max_depth, objects=ground, directions=256)
+    scene = case.load()
+    weights, params = pixel_weights(scene), mi.traverse(scene)
+    key = first_key(params, "sigma_t")
+    value = np.array(params[key], dtype=np.float64)
+    gradient = gradients(scene, ("sigma_t",), weights)["sigma_t"]
+    change = 0.1 * value * (1 + np.sin(np.arange(8)))[:, None]
+    objectives = []
+    for sign in (1, -1):
+        params[key] = mi.TensorXf((value + sign * change).astype(np.float32))
+        params.update()
+        found.clear()
+        gradients(scene, ("sigma_t",), weights)
+        objectives.append(sum(found))
+        params = mi.traverse(scene)
+    difference = 0.5 * (objectives[0] - objectives[1])
+    assert (gradient * change).sum() == pytest.approx(difference, rel=0.03)
 
 
 def test_hidden_lamps_do_not_hide_the_medium(mono):
@@ -181,10 +223,9 @@ INSIDE = {"ball": {"type": "sphere", "radius": 0.3}}
 @pytest.mark.parametrize(
     ("case", "suffix", "properties", "reason"),
     [
-        (SMALL, "sigma_t.data", {"max_depth": 2}, "max_depth is 2"),
+        (SMALL, "sigma_t.data", {"max_depth": 3, "solver": "auto"}, "max_depth is 3"),
         (SMALL, "sigma_t.data", {"solver": "path", "cache_spp": 8}, 'the solver is "path"'),
         (SMALL, "floor.to_world", {}, "it belongs to a"),
-        (Case(data=6, cache=6, objects=ground, g=0.3), "sigma_t.data", {}, "anisotropically"),
         (Case(data=6, cache=6, objects=lambda: INSIDE), "sigma_t.data", {}, "surface reaches into"),
         (
             Case(data=6, cache=6, objects=lambda: ground(0.0)),
@@ -196,6 +237,12 @@ INSIDE = {"ball": {"type": "sphere", "radius": 0.3}}
 )
 def test_what_has_no_gradients_is_refused_by_name(rgb, case, suffix, properties, reason):
     assert reason in refused(case, suffix, **properties)
+
+
+def test_many_lamps_around_anisotropic_media_are_refused(rgb, monkeypatch):
+    monkeypatch.setattr(traced, "MAX_LAMPS", 0)
+    case = replace(SMALL, emitters=dict, objects=lamp, g=0.3)
+    assert "1 area emitters" in refused(case, "sigma_t.data")
 
 
 def test_forward_mode_is_refused(rgb, fewer_paths):

@@ -292,10 +292,12 @@ def lamp() -> dict:
     return {"lamp": {"type": "rectangle", "to_world": place, "emitter": light}}
 
 
-def second_medium(away: float) -> dict:
+def second_medium(away: float, g: float | None = None) -> dict:
     """A homogeneous cube beside the medium, at a distance."""
     place = mi.ScalarTransform4f().translate([-2.0 - away, 0, 0])
     interior = {"type": "homogeneous", "sigma_t": 0.8, "albedo": 0.9}
+    if g is not None:
+        interior["phase"] = {"type": "hg", "g": g}
     shape = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": interior}
     return {"other": shape}
 
@@ -336,8 +338,51 @@ def surrounded() -> dict[str, Case]:
         "two media side by side, sun": Case(
             emitters=_under(sun=SUN), objects=lambda: second_medium(0.002)
         ),
+        "ground, sky, single": Case(objects=ground, max_depth=2, parameters=(*both, "floor")),
+        "ground, sun, single": Case(emitters=_under(sun=SUN), objects=ground, max_depth=2),
+        "lamp over a ground, single": Case(
+            emitters=dict,
+            objects=lambda: ground() | lamp(),
+            max_depth=2,
+            parameters=(*both, "lamp"),
+        ),
+        "hg 0.5, ground, sky": Case(g=0.5, objects=ground, parameters=(*both, "floor")),
+        "hg 0.5, ground, sun": Case(g=0.5, emitters=_under(sun=SUN), objects=ground),
+        "hg 0.5, ground, sun, single": Case(
+            g=0.5, emitters=_under(sun=SUN), objects=ground, max_depth=2
+        ),
+        "hg 0.5, ground, point": Case(g=0.5, emitters=_under(point=POINT), objects=ground),
+        "hg 0.5, ground, envmap": Case(
+            g=0.5, emitters=lambda: {"sky": sky_with_sun()}, objects=ground
+        ),
+        "hg -0.4, ground, spot": Case(g=-0.4, emitters=lambda: {"spot": spot()}, objects=ground),
+        "hg 0.5, lamp over a ground": Case(
+            g=0.5, emitters=dict, objects=lambda: ground() | lamp(), parameters=(*both, "lamp")
+        ),
+        "hg 0.5, two media, sun": Case(
+            g=0.5,
+            emitters=_under(sun=SUN),
+            objects=lambda: second_medium(0.5, g=-0.4),
+            parameters=(*both, "other.interior_medium.sigma_t"),
+        ),
+        "hg 0.5, distant object, empty voxels": Case(
+            g=0.5,
+            empty_beyond=0.5,
+            changed=(0.75, 0.85),
+            objects=distant,
+            emitters=_under(sun=SUN),
+            parameters=("sigma_t",),
+        ),
+        "hg 0.85, ground, sky": Case(g=0.85, objects=ground),
+        "hg 0.85, ground, sun": Case(g=0.85, emitters=_under(sun=SUN), objects=ground),
+        "hg 0.85, lamp over a ground": Case(
+            g=0.85, emitters=dict, objects=lambda: ground() | lamp()
+        ),
     }
-    return {name: replace(case, directions=256, step=0.12) for name, case in found.items()}
+    return {
+        name: replace(case, directions=512 if case.g else 256, step=0.12)
+        for name, case in found.items()
+    }
 
 
 COLOURED = {"albedo": (0.6, 0.75, 0.85), "emitters": _under(sky=SKY)}

@@ -1,0 +1,316 @@
+"""A medium among surfaces or other media: its fluence, and what radiance in it is worth.
+
+Where scattering is isotropic, both the fluence and its adjoint have one component; otherwise they
+have those of `scattering`: moments, and the irradiance of each narrow source.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.cache.angular_field import AngularField
+from mitsuba_irrcache.cache.border import BorderProfile
+from mitsuba_irrcache.cache.lookups import root_field
+from mitsuba_irrcache.core.spectrum import interleaved
+from mitsuba_irrcache.gradients.fluence import cached_components
+from mitsuba_irrcache.gradients.forward_peak import with_forward_peak
+from mitsuba_irrcache.gradients.medium import (
+    EMPTY,
+    MARGIN,
+    PAIRS,
+    SHARP_PAIRS,
+    field_of,
+    splat_of,
+    sums_for,
+)
+from mitsuba_irrcache.gradients.parameters import ALBEDO, SIGMA_T
+from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, InScattering
+from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
+from mitsuba_irrcache.gradients.scattering import Components, IsotropicScattering
+from mitsuba_irrcache.gradients.splatting import VoxelSums
+from mitsuba_irrcache.gradients.transport import AdjointTransport, TransportSettings
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.narrow_sources import sources_of
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
+
+
+@dataclass
+class AdjointFluence:
+    """The adjoint fluence of collisions in the voxels of a medium, by channel.
+
+    Attributes:
+        camera: the components of that of rays from outside.
+        travelled: the components of that which has travelled between voxels.
+    """
+
+    camera: list[Components]
+    travelled: list[Components]
+
+    def __add__(self, other: AdjointFluence) -> AdjointFluence:
+        pairs = (self.camera, other.camera), (self.travelled, other.travelled)
+        return AdjointFluence(*(_sums(*pair) for pair in pairs))
+
+
+def _sums(first: list[Components], second: list[Components]) -> list[Components]:
+    return [[a + b for a, b in zip(*own, strict=True)] for own in zip(first, second, strict=True)]
+
+
+class KnownFluence:
+    """The fluence of a medium on the grid of its cache, see `FluenceAlongRays`.
+
+    ``values`` are the components of each channel; ``basis`` is None for isotropic scattering.
+    """
+
+    falloff = None
+
+    def __init__(
+        self,
+        grid: Grid,
+        values: list[Components],
+        border: BorderProfile | None,
+        basis: AngularBasis | None,
+    ) -> None:
+        irradiance = [components[0] for components in values]
+        roots = [dr.sqrt(dr.maximum(v, 0)) for v in irradiance]
+        flat, known = interleaved(roots, grid.voxel_count), dr.full(mi.Bool, True, grid.voxel_count)
+        self.irradiance = root_field(grid, flat, known, len(values), border)
+        self.direct_lights, self.angular = [], None
+        if basis is not None:
+            higher = zip(*(components[1:] for components in values), strict=True)
+            moments = [layer for channels in higher for layer in channels]
+            self.angular = InScattering(AngularField(basis, grid, irradiance, moments), basis)
+
+
+class Importance:
+    """Derivative of an objective with respect to the radiance that is incident in voxels.
+
+    Args:
+        scattering: the components.
+        scale: for each channel, scattering coefficient times volume of the voxels.
+        adjoint: the adjoint fluence.
+    """
+
+    # docs/primer, eq. (8.21)
+
+    def __init__(
+        self, scattering: IsotropicScattering, scale: list[mi.Float], adjoint: AdjointFluence
+    ) -> None:
+        self._scattering, factors = scattering, scattering.product_factors()
+        #: the products of each channel, for each part of the radiance
+        self._parts = [
+            [
+                [factor * own * layer for factor, layer in zip(factors, components, strict=True)]
+                for components in scattering.of_parts(camera, travelled)
+            ]
+            for own, camera, travelled in zip(scale, adjoint.camera, adjoint.travelled, strict=True)
+        ]
+        dr.eval(self._parts)
+
+    def magnitude(self) -> mi.Float:
+        """Return a bound of the order of what radiance from any direction is worth in a voxel."""
+        norms = self._scattering.norms()
+        total = sum(
+            norm * dr.abs(layer)
+            for (smooth, *_) in self._parts
+            for norm, layer in zip(norms, smooth, strict=True)
+        )
+        # Components of narrow sources differ from the smooth ones in the first one only.
+        total += sum(
+            dr.abs(own[0] - smooth[0]) for (smooth, *narrow) in self._parts for own in narrow
+        )
+        dr.eval(total)
+        return total
+
+    def of(self, voxel: mi.UInt32, towards: mi.Vector3f) -> mi.Spectrum:
+        """Return the derivative with respect to irradiance from the direction ``towards``."""
+        return self._of_part(0, voxel, self._scattering.moments.basis(towards))
+
+    def of_emitters(self, voxel: mi.UInt32, p: mi.Point3f, towards: mi.Vector3f) -> mi.Spectrum:
+        """Return the derivative with respect to irradiance of emitters at ``p``, seen in the
+        direction ``towards``.
+        """
+        basis = self._scattering.moments.basis(towards)
+        found = self._of_part(0, voxel, basis)
+        for number, source in enumerate(self._scattering.sources, 1):
+            direction, cosine = source.seen_from(p)
+            own = dr.dot(towards, direction) >= cosine
+            found = dr.select(own, self._of_part(number, voxel, basis), found)
+        return found
+
+    def _of_part(self, number: int, voxel: mi.UInt32, basis: list[mi.Float]) -> mi.Spectrum:
+        values = []
+        for parts in self._parts:
+            pairs = zip(parts[number], basis, strict=True)
+            values.append(sum(dr.gather(mi.Float, layer, voxel) * y for layer, y in pairs))
+        return mi.Spectrum(*values)
+
+
+class CoupledMedium:
+    """A medium with its fluence, and the adjoint of transport within its box."""
+
+    def __init__(
+        self, scene: mi.Scene, part: CachedMedium, wanted: dict[str, int], step: float, seed: int
+    ) -> None:
+        self.medium, self.step = part.medium, step
+        #: numbers of channels of the derivatives to return and of the sums for them, by role
+        self.wanted, self._summed = wanted, sums_for(part.medium, wanted)
+        self.cache, self.grid = part.cache, part.cache.grid
+        #: whether radiance is scattered once only
+        self.single = part.settings.max_depth == 2
+        settings = TransportSettings(
+            (part.settings.seed, seed),
+            SHARP_PAIRS if part.medium.phase.forward else PAIRS,
+            single=self.single,
+            has_dense_boundary=self.cache.interpolation.border is not None,
+        )
+        self.transport = AdjointTransport(scene, part.medium, self.grid, (), settings)
+        found = VoxelQuadrature(part.medium, self.grid).extinction()
+        self.channels = self.transport.channels
+        self.extinction = list(found)[: self.channels]
+        dr.eval(self.extinction)
+        self.values = [self._cached(scene, channel) for channel in range(self.channels)]
+        self._update()
+
+    @property
+    def basis(self) -> AngularBasis | None:
+        """The angular basis of the components; None for isotropic scattering."""
+        return self.transport.scattering.basis
+
+    @property
+    def components(self) -> int:
+        """Number of components of the adjoint fluence of rays from outside."""
+        return self.transport.scattering.camera_count
+
+    def _cached(self, scene: mi.Scene, channel: int) -> Components:
+        """Return the components of the cached fluence of a channel, 0 at inactive voxels."""
+        cache, known = self.cache, cached_components(self.cache, channel)
+        if self.basis is None:
+            return known
+        count = self.transport.scattering.count
+        values, sources = known[:count], self.basis.sources
+        narrow = [dr.zeros(mi.Float, self.grid.voxel_count) for _ in sources]
+        for own, irradiance in zip(cache.directional.sources, known[count:], strict=True):
+            narrow[_index(sources, own)] = irradiance
+        for light in cache.direct_lights:
+            # The cached moments exclude what camera rays evaluate in closed form.
+            (own,) = sources_of(scene, [light.emitter])[1]
+            irradiance = self._spread(light.irradiance[channel])
+            narrow[_index(sources, own)] = irradiance
+            if not own.sharp:
+                means = [self._spread(mean[channel]) for mean in light.angular_means()]
+                higher = zip(values[1:], means, strict=False)
+                values[1:] = [a + irradiance * mean for a, mean in higher]
+        dr.eval(values, narrow)
+        return values + narrow
+
+    def _spread(self, values: mi.Float) -> mi.Float:
+        """Return ``values`` of the active voxels at all voxels."""
+        found = dr.zeros(mi.Float, self.grid.voxel_count)
+        dr.scatter(found, values, self.cache.active)
+        return found
+
+    @property
+    def unknown(self) -> mi.UInt32:
+        """The voxels without a cached fluence."""
+        known = dr.opaque(mi.Bool, False, self.grid.voxel_count)
+        if self.cache.active_count and self.cache.samples:
+            dr.scatter(known, mi.Bool(True), self.cache.active)
+        return dr.compress(~known)
+
+    def complete(self, voxels: mi.UInt32, values: list[Components]) -> None:
+        """Set the components of the fluence of ``voxels``, by channel."""
+        for own, components in zip(self.values, values, strict=True):
+            for layer, value in zip(own, components, strict=True):
+                dr.scatter(layer, value, voxels)
+        dr.eval(self.values)
+        self._update()
+
+    def _update(self) -> None:
+        fluence = KnownFluence(self.grid, self.values, self.cache.border, self.basis)
+        self.march = CameraReplay(self.medium, fluence, None, self.step)
+
+    def moments(
+        self, p: mi.Point3f, contributions: list[tuple[mi.Vector3f, mi.Spectrum, mi.Spectrum]]
+    ) -> list[mi.Spectrum]:
+        """Return the components of the fluence at ``p``, given irradiance from directions, straight
+        from emitters and scattered.
+        """
+        total = sum((a + b for _, a, b in contributions), mi.Spectrum(0))
+        return [total] if self.basis is None else [total, *self.basis.moments(p, contributions)]
+
+    def scattered(self, camera: list[Components]) -> AdjointFluence:
+        """Return the adjoint fluence with all scattering within the box, given that of rays from
+        outside.
+        """
+        return AdjointFluence(camera, self.transport.adjoint(camera)[1])
+
+    def entering(self, camera: list[Components]) -> AdjointFluence:
+        """Return the adjoint fluence before any scattering within the box, given that of rays from
+        outside.
+        """
+        count = self.transport.scattering.count
+        none = [[0 * layer for layer in components[:count]] for components in camera]
+        return AdjointFluence(camera, none)
+
+    def importance(self, adjoint: AdjointFluence) -> Importance:
+        """Return what radiance in the voxels is worth."""
+        volume = dr.opaque(mi.Float, volume_of(self.grid))
+        pairs = zip(self.extinction, self.transport.albedo, strict=False)
+        return Importance(self.transport.scattering, [volume * s * a for s, a in pairs], adjoint)
+
+    def mean(self, sums: VoxelSums) -> list[Components]:
+        """Return the adjoint fluence of the collisions that are summed in ``sums``, by channel."""
+        # docs/primer, eq. (8.4)
+        least = dr.opaque(mi.Float, EMPTY / float(self.grid.voxel_size.min()))
+        volume, values = dr.opaque(mi.Float, 1 / volume_of(self.grid)), sums.values()
+        found = [
+            [
+                dr.select(s > least, total * volume / dr.maximum(s, least), 0)
+                for total in values[c * self.components : (c + 1) * self.components]
+            ]
+            for c, s in enumerate(self.extinction)
+        ]
+        dr.eval(found)
+        return found
+
+    def splats(
+        self, largest: float, count: float, collisions: bool, derivatives: bool
+    ) -> CameraSplats:
+        """Return sums, 0 at first, for the ``count`` paths with this ``largest`` weighted radiance.
+
+        ``collisions`` and ``derivatives`` select the sums.
+        """
+        sums, peak = None, self.medium.phase.peak
+        if collisions:
+            bound = largest * count * MARGIN * peak
+            sums = VoxelSums(self.grid, self.channels * self.components, bound)
+        found = {SIGMA_T: None, ALBEDO: None}
+        if derivatives:
+            length = float(np.linalg.norm(self.grid.side_lengths))
+            mean = self.march.irradiance.maximum * peak / (4 * np.pi)
+            bounds = {SIGMA_T: largest * (1 + mean) * length, ALBEDO: largest * mean}
+            found |= {
+                role: splat_of(field_of(self.medium, role), own, bounds[role] * count * MARGIN)
+                for role, own in self._summed.items()
+            }
+        return CameraSplats(found[SIGMA_T], found[ALBEDO], sums)
+
+    def derivatives(self, splats: CameraSplats) -> dict[str, mi.Float]:
+        """Return the ``wanted`` derivatives with respect to the scene's medium, by role, at the
+        voxels of its data, given those with respect to the medium as it is rendered.
+        """
+        sums = {SIGMA_T: splats.sigma_t, ALBEDO: splats.albedo}
+        found = {role: sums[role].values() for role in self._summed}
+        if self.medium.original is None or not found:
+            return found
+        return with_forward_peak(self.medium, found, self._summed[SIGMA_T], self.wanted)
+
+
+def _index(sources: list, source: object) -> int:
+    """Return the index of the same source among ``sources``."""
+    return next(i for i, other in enumerate(sources) if other.is_same(source))
