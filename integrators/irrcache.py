@@ -237,12 +237,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     adjoint transport equation with the solver ``sweep``, for one medium in a box or sphere under
     distant and point emitters (not inside of it if delta-M applies), with ``max_depth`` 1, 2 or -1,
     no filter and no ``aovs``. Emissive media have gradients by ``emission`` only. Surfaces, area
-    emitters and several media may be around isotropic media if ``max_depth`` is -1; ``dr.backward``
-    then has gradients by the reflectance of ``diffuse`` BSDFs, too. In isotropic media without
-    surfaces there are also gradients by ``position`` of points and ``to_world`` of suns. All other
-    gradients are refused with an error that names the parameter. While parameters carry gradients,
-    the grid of the cache is kept. Images of the same state of the scene in one loss share one
-    adjoint solve; ``cache_spp`` also sets its directions.
+    emitters and several media may be around media that do not emit if ``max_depth`` is 2 or -1;
+    ``dr.backward`` then has gradients by the reflectance of ``diffuse`` BSDFs instead of ``g``. In
+    isotropic media without surfaces there are also gradients by ``position`` of points and
+    ``to_world`` of suns. All other gradients are refused with an error that names the parameter.
+    While parameters carry gradients, the grid of the cache is kept. Images of the same state of the
+    scene in one loss share one adjoint solve; ``cache_spp`` also sets its directions.
 
     .. tabs::
         .. code-tab:: xml

@@ -100,14 +100,23 @@ class Subject:
             values = means(values, axis, length / lengths.max(), self.voxels)
         return (values / values.max() * volume.depth / EDGE)[..., None].astype(np.float32)
 
-    def load(self, integrator: dict, extinction: np.ndarray) -> mi.Scene:
-        """Load the scene with this ``extinction`` (z, y, x, 1)."""
+    def load(
+        self, integrator: dict, extinction: np.ndarray, albedo_on_grid: bool = False
+    ) -> mi.Scene:
+        """Load the scene with this ``extinction`` (z, y, x, 1), and an albedo at the same voxels or
+        a constant one.
+        """
         to_world = mi.ScalarTransform4f().translate([-EDGE / 2] * 3).scale(EDGE)
-        grid = {"type": "gridvolume", "grid": mi.VolumeGrid(extinction), "raw": True}
+
+        def volume(values: np.ndarray) -> dict:
+            grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values), "raw": True}
+            return grid | {"to_world": to_world}
+
+        albedo = VOLUMES[self.name].albedo
         medium = {
             "type": "heterogeneous",
-            "sigma_t": grid | {"to_world": to_world},
-            "albedo": VOLUMES[self.name].albedo,
+            "sigma_t": volume(extinction),
+            "albedo": volume(np.full_like(extinction, albedo)) if albedo_on_grid else albedo,
         }
         cube = {"type": "cube", "bsdf": {"type": "null"}, "interior": medium}
         own = {"integrator": {"max_depth": -1} | integrator, "sky": SKY, "sun": SUN, "cube": cube}

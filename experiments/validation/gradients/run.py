@@ -4,7 +4,8 @@
 
 The first table has for each case and parameter the relative error and the cosine of directional
 derivatives along smooth perturbations (`differences`), and the error in forward mode, the second
-one has those among surfaces, the third one errors by voxel at equal CPU time (`beside_prb`).
+one has those among surfaces, the third and the fourth one errors by voxel at equal CPU time
+(`beside_prb`), of a synthetic and of real volumes.
 ``--case`` runs the cases of the first two whose names contain it.
 """
 
@@ -38,12 +39,13 @@ FEWER_BLOBS = 3
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--case", default="", help="part of the names of the cases to run")
-    parser.add_argument("--only", choices=("isolated", "surfaces", "prbvolpath"), help="one table")
+    kinds = ("isolated", "surfaces", "prbvolpath", "real")
+    parser.add_argument("--only", choices=kinds, help="one table")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("--voxels", type=int, default=32, help="along a side, beside prbvolpath")
     add_document(parser)
@@ -59,6 +61,9 @@ def main() -> None:
     if options.only in (None, "prbvolpath") and not options.case:
         tables["gradients-prb"] = beside_prb.table(options.voxels)
         print(tables["gradients-prb"].as_text())
+    if options.only in (None, "real") and not options.case:
+        tables["gradients-real"] = beside_prb.real_table((32, 64))
+        print(tables["gradients-real"].as_text())
     if options.document:
         replace_tables(options.document, tables)
 
