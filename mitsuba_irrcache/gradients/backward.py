@@ -119,6 +119,7 @@ class ParameterAdjoint:
         roles = roles_of(params, keys, medium, scene, emission)
         self._keys, self._roles = keys, roles
         self._of_medium = {k: role for k, role in roles.items() if isinstance(role, str)}
+        _check_mean_cosine(part, self._of_medium)
         self._placed = {k: role for k, role in roles.items() if isinstance(role, Placement)}
         if part.cache is not None:
             check_placements(self._placed, part.cache.grid)
@@ -205,7 +206,16 @@ def check_placements(placed: dict[str, Placement], grid: Grid) -> None:
         if kind_of(role.emitter) is EmitterKind.SUN:
             continue
         if lies_in(role.emitter, grid):
-            refuse(key, "the light is in the medium")
+            refuse(key, "the light is in the medium, or within a voxel of it")
+
+
+def _check_mean_cosine(part: CachedMedium, of_medium: dict[str, str]) -> None:
+    """Refuse derivatives by a mean cosine of 0, for which the cache has no moments."""
+    if not part.medium.phase.is_isotropic:
+        return
+    for key, role in of_medium.items():
+        if role == MEAN_COSINE:
+            refuse(key, "it is 0, where scattering is isotropic; start with 0.01 or -0.01")
 
 
 def _check_emission(part: CachedMedium, of_medium: dict[str, str]) -> None:

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients.emitters import solid_angles
+from mitsuba_irrcache.gradients.emitters import environment_angles
 from mitsuba_irrcache.gradients.lights import LightsOfOneDirection
 from mitsuba_irrcache.gradients.parameters import refuse
 from mitsuba_irrcache.gradients.transport import AdjointTransport
@@ -92,7 +92,7 @@ class EmitterTangents:
                 result[rows] = incoming[rows][..., [channel]] * np.array(factor)
         if self._environment is not None:
             both = np.stack([directions[:end], -directions[:end]], axis=1).reshape(-1, 3)
-            angle = solid_angles(self._scene.environment(), both, incoming[:end])
+            angle = environment_angles(transport)
             change = self._environment.along(mi.Vector3f(both.T.astype(np.float32)))
             values = [np.broadcast_to(np.array(c, np.float64), len(both)) for c in change]
             result[:end] = np.stack(values, axis=1).reshape(end, 2, -1) * angle

@@ -17,7 +17,7 @@ import numpy as np
 from mitsuba_irrcache.gradients.resampling import volume_of
 from mitsuba_irrcache.gradients.scattering import Components, OrdinatePart
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
-from mitsuba_irrcache.lights.environments import environment_radiance
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 
 
@@ -53,7 +53,7 @@ class EmitterAdjoint:
         if self._environment is None and not any(sun in self._wanted for sun in suns):
             return
         derivatives = self._derivatives_by_ordinates(transport, found)
-        directions, incoming, *_ = transport.ordinates
+        directions = transport.ordinates.directions
         tracks, end = lights.sun_tracks, lights.even
         for number, sun in enumerate(suns):
             if sun in self._wanted:
@@ -61,7 +61,7 @@ class EmitterAdjoint:
                 _add_sun(sun, rows.mean(axis=0))
         if self._environment is not None:
             both = np.stack([directions[:end], -directions[:end]], axis=1).reshape(-1, 3)
-            angle = solid_angles(self._environment, both, incoming[:end])
+            angle = environment_angles(transport)
             towards = mi.Vector3f(both.T.astype(np.float32))
             adjoint = (derivatives[:end] * angle).reshape(len(both), -1)
             self._add_environment(towards, mi.Spectrum(adjoint.T.astype(np.float32)))
@@ -131,26 +131,23 @@ def _transmitted_importance(
     return [result * volume_of(transport.grid) for result in found]
 
 
-def solid_angles(environment: mi.Emitter, both: np.ndarray, incoming: np.ndarray) -> np.ndarray:
-    """Return the solid angles that weight the radiance along each ordinate and its opposite."""
-    radiance = environment_radiance(environment, both).reshape(-1, 2, incoming.shape[-1])
-    is_lit = radiance > 0
-    angle = np.where(is_lit, incoming / np.where(is_lit, radiance, 1), 0)
-    most = angle.max(axis=-1, keepdims=True)
-    return np.where(is_lit, angle, most)
+def environment_angles(transport: AdjointTransport) -> np.ndarray:
+    """Return the solid angles (n, 2, channels) that the ordinates before those of suns represent
+    for the radiance of the environment.
+    """
+    own = Ordinates(*(values[: transport.lights.even] for values in transport.ordinates))
+    return transport.illumination.solid_angles(own)
 
 
 def _add_point(light: int, transport: AdjointTransport, found: Derivatives) -> None:
     """Accumulate the derivatives through the irradiance of a point-like light."""
     lights = transport.lights
-    emitter, irradiance = lights.emitters[light], lights.irradiance[light]
+    emitter = lights.emitters[light]
     at = dr.zeros(mi.Interaction3f, transport.grid.voxel_count)
     at.p = lights.positions
-    _, unattenuated = emitter.sample_direction(at, mi.Point2f(0.5))
-    is_lit = unattenuated > 0
-    transmittance = dr.select(is_lit, irradiance / dr.select(is_lit, unattenuated, 1), 0)
-    share = dr.opaque(mi.Float, volume_of(transport.grid))
-    adjoint = transmittance * lights.derivative(light, found.direct) * share
+    # Not the ratio of the irradiance to that without the medium: both may be 0 in a channel.
+    share = lights.spread * dr.opaque(mi.Float, volume_of(transport.grid))
+    adjoint = lights.transmittance(light) * lights.derivative(light, found.direct) * share
     dr.eval(at, adjoint)
     with dr.resume_grad():
         _, value = emitter.sample_direction(at, mi.Point2f(0.5))

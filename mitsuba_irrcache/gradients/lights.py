@@ -44,8 +44,9 @@ class LightsOfOneDirection:
         self.positions = VoxelSamplePoints(scene, grid).of(voxels)
         self.at_positions = illumination.point_irradiance(medium, self.positions)
         falloff = InverseSquareFactor.of(scene, grid) if self.at_positions else None
-        mean = falloff.spread(voxels) if falloff is not None else mi.Float(1)
-        self.irradiance = [irradiance * mean for irradiance in self.at_positions]
+        #: ratio of means over the voxels to values at the positions, for points and spots
+        self.spread = falloff.spread(voxels) if falloff is not None else mi.Float(1)
+        self.irradiance = [irradiance * self.spread for irradiance in self.at_positions]
         dr.eval(self.at_positions, self.irradiance)
         self.parts = scattering.point_parts(self.points)
         self._medium = medium
@@ -71,6 +72,15 @@ class LightsOfOneDirection:
         at = dr.zeros(mi.Interaction3f, dr.width(self.positions))
         at.p = self.positions
         return self.emitters[light].sample_direction(at, mi.Point2f(0.5))[0].d
+
+    def transmittance(self, light: int) -> mi.Spectrum:
+        """Return the transmittance of the medium between each voxel and a point or spot."""
+        at = dr.zeros(mi.Interaction3f, dr.width(self.positions))
+        at.p = self.positions
+        record, _ = self.emitters[light].sample_direction(at, mi.Point2f(0.5))
+        ray = mi.Ray3f(self.positions, record.d)
+        through = medium_transmittance(self._medium, ray, record.dist, mi.Bool(True))
+        return mi.Spectrum(through)
 
     def derivative(self, light: int, direct: list[list[Components]]) -> mi.Spectrum:
         """Return the derivatives with respect to the irradiance of an emitter, by voxel.

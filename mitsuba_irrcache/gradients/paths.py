@@ -289,7 +289,9 @@ class PathAdjoint:
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Ray3f, mi.Spectrum]:
         """Sample an emitter: the record, radiance over density, shadow ray and transmittance."""
         record, emitter = self._scene.sample_emitter_direction(origin, sample, False, active)
-        active = active & (record.pdf > 0) & (dr.max(dr.abs(emitter)) > 0)
+        active = active & (record.pdf > 0)
+        if not self._emitters:  # the derivative with respect to a radiance of 0 is not 0
+            active = active & (dr.max(dr.abs(emitter)) > 0)
         shadow = mi.Ray3f(origin.spawn_ray_to(record.p))
         shadow.d = record.d
         shadow.maxt = dr.largest(mi.Float)
@@ -468,12 +470,13 @@ class PathAdjoint:
                 march.replay(rays, vertex.direct + none, none, attenuation)
         dr.eval()
         if self._emitters:
+            record = vertex.record
+            sampled = vertex.active & (record.pdf > 0)
             with dr.resume_grad():
-                record = vertex.record
-                value = self._scene.eval_emitter_direction(vertex.origin, record, lit)
+                value = self._scene.eval_emitter_direction(vertex.origin, record, sampled)
                 pull(
                     value / dr.select(record.pdf > 0, record.pdf, 1),
-                    dr.select(lit, vertex.emitter_weight, 0),
+                    dr.select(sampled, vertex.emitter_weight, 0),
                 )
         if self._surfaces and vertex.surface is not None:
             self._add_surface(vertex, rest, lit)

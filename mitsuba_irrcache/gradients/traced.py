@@ -195,7 +195,16 @@ def roles_among(
             for node, bsdf in _reflectances(shape.bsdf()).items():
                 add_user(nodes, node, bsdf)
     roles = {key: role_of(params, key, nodes) for key in keys}
+    specular = {
+        node: user
+        for shape in scene.shapes()
+        if shape.bsdf() is not None
+        for node, user in _specular_textures(shape.bsdf()).items()
+    }
     for key, role in roles.items():
+        user = specular.get(params.properties[key][2])
+        if user is not None:
+            refuse(key, f"a {user.class_name()} depends on it, too; give each a texture of its own")
         reflects = any(isinstance(user, mi.BSDF) for user in users_of(role))
         if reflects and not float(np.min(np.array(params[key]))) > 0:
             refuse(key, "it is 0 somewhere, where paths end; start with a small positive value")
@@ -211,3 +220,17 @@ def _reflectances(bsdf: mi.BSDF) -> dict[mi.Object, mi.BSDF]:
         return {}
     texture = own["reflectance"]
     return dict.fromkeys((texture, *children(texture).values()), bsdf)
+
+
+def _specular_textures(bsdf: mi.BSDF) -> dict[mi.Object, mi.BSDF]:
+    """Return the textures of BSDFs that reflect or transmit in single directions, for which
+    `PathAdjoint` has no derivatives.
+    """
+    found, own = {}, children(bsdf)
+    flags = mi.BSDFFlags.Delta | mi.BSDFFlags.Null
+    for child in own.values():
+        if isinstance(child, mi.BSDF):
+            found |= _specular_textures(child)
+        elif mi.has_flag(bsdf.flags(), flags):
+            found |= dict.fromkeys((child, *children(child).values()), bsdf)
+    return found

@@ -90,6 +90,7 @@ class AdjointTransport:
 
     Attributes:
         channels: number of channels that are computed.
+        illumination: the distant emitters.
         colour: factor of the radiance of each channel, if one is computed for all; otherwise 1.
     """
 
@@ -107,7 +108,7 @@ class AdjointTransport:
         self.neighbours = NeighbouringPhases(medium.phase) if MEAN_COSINE in wanted else None
         colours = 1 if mi.is_monochromatic else 3
         pairs, rng = settings.pairs, np.random.default_rng((*settings.seed, 0x67726164))
-        illumination = DistantIllumination(scene)
+        self.illumination = illumination = DistantIllumination(scene)
         if settings.grey:
             (self.ordinates,), self.colour = illumination.factored_ordinates(1, pairs, colours, rng)
         else:

@@ -124,6 +124,71 @@ def test_images_are_linear_in_the_radiance_of_emitters(rgb, name, max_depth):
     assert (gradient * step).sum() == pytest.approx(expected, rel=0.02)
 
 
+def dark_sky_with_sun() -> dict:
+    """An environment map that is black except for a bright spot."""
+    values = np.zeros((16, 32, 3), dtype=np.float32)
+    values[4, 7] = 60.0
+    return {"type": "envmap", "bitmap": mi.Bitmap(values)}
+
+
+BLACK = {
+    "sky": (lambda: {"sun": SUN, "sky": SKY | {"radiance": 0.0}}, "sky.radiance.value"),
+    "sun": (lambda: {"sky": SKY, "sun": SUN | {"irradiance": 0.0}}, "sun.irradiance.value"),
+    "point": (lambda: {"sky": SKY, "point": POINT | {"intensity": 0.0}}, "point.intensity.value"),
+    "one channel of a point": (
+        lambda: {"point": POINT | {"intensity": {"type": "rgb", "value": [9.0, 0.0, 0.0]}}},
+        "point.intensity.value",
+    ),
+    "spot": (lambda: {"sky": SKY, "spot": spot() | {"intensity": 0.0}}, "spot.intensity.value"),
+    "texels": (lambda: {"sky": dark_sky_with_sun()}, "sky.data"),
+}
+
+
+@pytest.mark.parametrize("name", BLACK)
+def test_emitters_without_radiance_have_gradients(rgb, name):
+    """Their radiance may grow: it was divided by itself, so that these gradients were 0."""
+    emitters, key = BLACK[name]
+    case = Case(data=8, cache=8, emitters=emitters)
+    assert_linear(case.load(hide_emitters=True), key, added=10.0)
+
+
+def test_dim_texels_beside_a_bright_spot_have_gradients(mono):
+    """The irradiance of all directions but the bright ones is normalised, by up to 2.9 here."""
+    values = np.full((16, 32, 3), 1e-3, dtype=np.float32)
+    values[3:6, 6:9] = 8.0
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(values)}
+    for seed in range(3):
+        scene = Case(data=8, cache=8, emitters=lambda: {"sky": sky}).load(
+            hide_emitters=True, cache_seed=seed
+        )
+        assert_linear(scene, "sky.data", added=1.0, tolerance=0.08, lowest=5)
+
+
+def assert_linear(
+    scene: mi.Scene, key: str, added: float, tolerance: float = 0.03, lowest: int = 0
+) -> None:
+    """Assert that the gradient by a radiance is the change of the image with ``added`` radiance, of
+    the ``lowest`` rows of a map only, if any.
+    """
+    weights, params = pixel_weights(scene), mi.traverse(scene)
+    value = np.array(params[key], dtype=np.float64)
+    leaf = type(params[key])(value.astype(np.float32))
+    dr.enable_grad(leaf)
+    params[key] = leaf
+    params.update()
+    image = mi.render(scene, params, spp=64, seed=3)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32))))
+    gradient = np.array(dr.grad(leaf), dtype=np.float64)
+    step = np.full(value.shape, added)
+    if lowest:
+        step[:-lowest] = 0
+    before = (np.array(dr.detach(image), dtype=np.float64) * weights).sum()
+    params[key] = type(leaf)((value + step).astype(np.float32))
+    params.update()
+    after = (np.array(mi.render(scene, spp=64, seed=3), dtype=np.float64) * weights).sum()
+    assert (gradient * step).sum() == pytest.approx(after - before, rel=tolerance)
+
+
 @pytest.mark.parametrize("max_depth", [2, -1])
 @pytest.mark.parametrize("kind", ["sun", "point"])
 def test_positions_and_directions_of_lights_have_gradients(rgb, kind, max_depth):
@@ -457,6 +522,11 @@ def test_other_parameters_are_refused_by_name(rgb, suffix, reason):
 def test_placements_are_refused_in_anisotropic_media(rgb, g, name):
     scene = Case(data=8, cache=8, g=g, emitters=lambda: {"sun": SUN, "point": POINT}).load()
     assert "is not the radiance of" in refused(scene, name)
+
+
+def test_a_mean_cosine_of_zero_is_refused(rgb):
+    scene = Case(data=8, cache=8, g=0.0).load()
+    assert "it is 0" in refused(scene, "phase_function.g")
 
 
 def test_positions_of_lights_in_the_medium_are_refused(rgb):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import drjit as dr
@@ -9,7 +10,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.validation.gradients.cases import SURROUNDED, Case, distant, ground, lamp
+from experiments.validation.gradients.cases import (
+    POINT,
+    SKY,
+    SUN,
+    SURROUNDED,
+    Case,
+    distant,
+    ground,
+    lamp,
+)
 from experiments.validation.gradients.differences import (
     compare,
     first_key,
@@ -208,7 +218,7 @@ def test_numbers_are_finite_with_black_matter_and_white_walls(rgb, fewer_paths):
 def refused(case: Case, suffix: str, **properties) -> str:
     scene = case.load(**properties)
     params = mi.traverse(scene)
-    (key,) = [k for k in params.keys() if k.endswith(suffix)]
+    (key,) = [k for k in params.keys() if re.search(f"{suffix}$", k)]
     dr.enable_grad(params[key])
     params.update()
     with pytest.raises(IrrcacheError) as error:
@@ -237,6 +247,60 @@ INSIDE = {"ball": {"type": "sphere", "radius": 0.3}}
 )
 def test_what_has_no_gradients_is_refused_by_name(rgb, case, suffix, properties, reason):
     assert reason in refused(case, suffix, **properties)
+
+
+def dark(name: str) -> tuple[dict, dict, str]:
+    """An emitter without radiance: emitters, shapes, and the key of the radiance."""
+    if name == "lamp":
+        shape = lamp()["lamp"] | {"emitter": {"type": "area", "radiance": 0.0}}
+        return {"sky": SKY}, {"lamp": shape}, "lamp.emitter.radiance.value"
+    emitters = {
+        "point": ({"sky": SKY, "point": POINT | {"intensity": 0.0}}, "point.intensity.value"),
+        "sun": ({"sky": SKY, "sun": SUN | {"irradiance": 0.0}}, "sun.irradiance.value"),
+        "sky": ({"sun": SUN, "sky": SKY | {"radiance": 0.0}}, "sky.radiance.value"),
+    }
+    own, key = emitters[name]
+    return own, ground(), key
+
+
+@pytest.mark.parametrize("name", ["lamp", "point", "sun", "sky"])
+def test_emitters_without_radiance_have_gradients(mono, fewer_paths, name):
+    """Samples of emitters without radiance were discarded, so that these gradients were 0."""
+    emitters, shapes, key = dark(name)
+    case = Case(data=6, cache=6, emitters=lambda: emitters, objects=lambda: shapes, directions=256)
+    scene = case.load(hide_emitters=True)
+    weights, params = pixel_weights(scene), mi.traverse(scene)
+    leaf = type(params[key])(dr.detach(params[key]))
+    dr.enable_grad(leaf)
+    params[key] = leaf
+    params.update()
+    image = mi.render(scene, params, spp=64, seed=3)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32))))
+    gradient = np.array(dr.grad(leaf), dtype=np.float64)
+    params[key] = type(leaf)(5.0)
+    params.update()
+    changed = np.array(mi.render(scene, spp=64, seed=3), dtype=np.float64)
+    difference = ((changed - np.array(dr.detach(image))) * weights).sum()
+    assert 5 * gradient.sum() == pytest.approx(difference, rel=0.04)
+
+
+@pytest.mark.parametrize("kind", ["mask", "conductor"])
+def test_textures_of_specular_surfaces_are_refused(rgb, kind):
+    texture = {
+        "type": "bitmap",
+        "id": "shared",
+        "bitmap": mi.Bitmap(np.full((4, 4, 3), 0.5, np.float32)),
+        "raw": True,
+    }
+    shared = {"type": "ref", "id": "shared"}
+    other = {"type": "conductor", "specular_reflectance": shared}
+    if kind == "mask":
+        other = {"type": "mask", "opacity": shared, "nested": {"type": "diffuse"}}
+    place = mi.ScalarTransform4f().translate([0, 0, 4]).scale(0.5)
+    shapes = ground(shared) | {"wall": {"type": "rectangle", "to_world": place, "bsdf": other}}
+    case = replace(SMALL, objects=lambda: {"shared": texture} | shapes)
+    kinds = {"mask": "MaskBSDF", "conductor": "SmoothConductor"}
+    assert f"a {kinds[kind]} depends on it" in refused(case, r"object_\d+\.data")
 
 
 def test_many_lamps_around_anisotropic_media_are_refused(rgb, monkeypatch):

@@ -200,13 +200,56 @@ class DistantIllumination:
         chosen = self._samples(len(even), count, rng)
         for (plain, weights), sampled in zip(even, chosen, strict=True):
             directions = np.concatenate([plain, sampled])
-            uniform = len(plain) / (2 * np.pi)
-            angle = 1 / (uniform + count * self._densities(directions).sum(axis=1))
-            angle[: len(plain)] *= weights * uniform
+            weights = np.concatenate([weights, np.zeros(count)])
+            angle = self._represented(directions, weights)
             incoming = self._both_ways(directions) * angle[:, None, None]
-            sets.append((directions, np.concatenate([weights, np.zeros(count)]), incoming))
+            sets.append((directions, weights, incoming))
         self._normalise_regions(sets)
         return sets
+
+    def _represented(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return the solid angles (n) that even ordinates and sampled ones, whose weight is 0,
+        represent.
+        """
+        is_even = weights != 0
+        count, sampled = int(is_even.sum()), int((~is_even).sum())
+        if not sampled:
+            return weights
+        uniform = count / (2 * np.pi)
+        angle = 1 / (uniform + sampled * self._densities(directions).sum(axis=1))
+        return np.where(is_even, angle * weights * uniform, angle)
+
+    def solid_angles(self, ordinates: Ordinates) -> np.ndarray:
+        """Return the solid angles (n, 2, channels) by which the radiance of the environment along
+        ``ordinates`` (without those of suns) and their opposites is multiplied.
+
+        In bright regions they follow from the irradiance, which is normalised there. Elsewhere they
+        do not depend on the radiance, which may be 0.
+        """
+        directions, incoming, weights, _ = ordinates
+        angle = np.broadcast_to(
+            self._represented(directions, weights)[:, None, None], incoming.shape
+        )
+        if not (weights == 0).any():
+            return angle
+        radiance = self._both_ways(directions)
+        known = radiance > 0
+        scaled = np.where(known, incoming / np.where(known, radiance, 1), 0)
+        scaled = np.where(known, scaled, scaled.max(axis=-1, keepdims=True))
+        return np.where(self._is_bright(directions)[..., None] & (scaled > 0), scaled, angle)
+
+    def _is_bright(self, directions: np.ndarray) -> np.ndarray:
+        """Return whether ``directions`` and their opposites (n, 2) are in bright regions."""
+        found = is_bright(self._densities(directions))
+        towards = np.stack([-directions, directions], axis=1)
+        for region in self._regions()[0]:
+            found |= region.covers(towards)
+        return found
+
+    def _regions(self) -> tuple:
+        if self._bright_regions is None:
+            self._bright_regions = spots_of(self._environment)
+        return self._bright_regions
 
     def _normalise_regions(self, sets: list[tuple]) -> None:
         """Scale the sampled irradiance of each bright region, and of all else, to its exact value.
@@ -216,9 +259,7 @@ class DistantIllumination:
         or lack of bright ones. If no direction outside of the spots is bright, that irradiance is
         assigned to the spots, which are most likely close to it.
         """
-        if self._bright_regions is None:
-            self._bright_regions = spots_of(self._environment)
-        regions, irradiance = self._bright_regions
+        regions, irradiance = self._regions()
         numbers = []
         for directions, *_ in sets:
             towards = np.stack([-directions, directions], axis=1)
