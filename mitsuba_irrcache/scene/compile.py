@@ -448,7 +448,7 @@ def _warn_of_scale(grids: Sequence[MediumGrid]) -> None:
     to their distance from the origin, is large compared to the medium.
     """
     for grid in grids:
-        offset = (1 + np.abs(corners_of(grid.frame)).max()) * RAY_OFFSET
+        offset = _ray_offset(grid)
         size = np.linalg.norm(grid.frame[:3, :3], axis=0).min()
         if offset > LARGEST_OFFSET * size:
             mi.Log(
@@ -459,9 +459,14 @@ def _warn_of_scale(grids: Sequence[MediumGrid]) -> None:
             )
 
 
+def _ray_offset(grid: MediumGrid) -> float:
+    """Return by how much Mitsuba offsets rays from the boundary of a medium."""
+    return float((1 + np.abs(corners_of(grid.frame)).max()) * RAY_OFFSET)
+
+
 def _warn_of_coincidence(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
-    """Log a warning if a surface lies in a face of the box that bounds a medium: which of them a
-    ray meets first is decided by rounding, and rays that cross the boundary first skip the surface.
+    """Log a warning if a surface lies in a face of the box that bounds a medium, or so close to it
+    that rays which cross the boundary skip it, because Mitsuba offsets them.
     """
     rng = np.random.default_rng(COINCIDENCE_POINTS)
     sample = mi.Point2f(np.float32(rng.random((2, COINCIDENCE_POINTS))))
@@ -472,13 +477,14 @@ def _warn_of_coincidence(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
         p = np.array(shape.sample_position(0.0, sample).p, dtype=np.float64)
         for grid in grids:
             is_box = grid.boundary.kind == "box" and grid.has_exact_boundary
-            if is_box and _lie_in_a_face(p, grid.frame):
+            if is_box and _lie_in_a_face(p, grid.frame, _ray_offset(grid)):
                 mi.Log(
                     mi.LogLevel.Warn,
                     f"irrcache: {described(shape)} lies in a face of the boundary of medium "
-                    f'"{grid.name}", and rounding decides which of them a ray meets first: '
-                    "radiance may pass the surface, also in volpath. Extend the boundary "
-                    "beyond the surface, or leave a gap of a thousandth of its size.",
+                    f'"{grid.name}", or within {_ray_offset(grid):.2g} of it, so that rays which '
+                    "cross the boundary pass the surface, also in volpath: the image is wrong "
+                    "around it. Extend the boundary beyond the surface, or leave a gap of a "
+                    "thousandth of its size.",
                 )
 
 
@@ -522,14 +528,16 @@ def _warn_of_normals(emitter: mi.Emitter) -> None:
         )
 
 
-def _lie_in_a_face(p: np.ndarray, frame: np.ndarray) -> bool:
+def _lie_in_a_face(p: np.ndarray, frame: np.ndarray, distance: float) -> bool:
     """Return whether a share of the points ``p`` (3, n) of a surface lies in the plane of a face of
-    the unit cube mapped by ``frame``, and their bounds overlap the face.
+    the unit cube mapped by ``frame``, or within a ``distance`` of it, and their bounds overlap the
+    face.
     """
     inverse = np.linalg.inv(frame)
     u = inverse[:3, :3] @ p + inverse[:3, 3:]
     for axis, face in itertools.product(range(3), (0, 1)):
-        own = np.abs(u[axis] - face) < COINCIDENT
+        edges = max(COINCIDENT, distance * np.linalg.norm(inverse[axis, :3]))
+        own = np.abs(u[axis] - face) < edges
         if own.mean() < COINCIDENT_SHARE:
             continue
         across = np.delete(u[:, own], axis, axis=0)

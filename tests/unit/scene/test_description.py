@@ -88,9 +88,13 @@ def test_nothing_can_be_changed(scenes):
     assert denser.macrocells is not medium.macrocells
 
 
-@pytest.mark.parametrize(("height", "expected"), [(-1.0, True), (-1.01, False), (-0.5, False)])
+@pytest.mark.parametrize(
+    ("height", "expected"), [(-1.0, True), (-1.0001, True), (-1.01, False), (-0.5, False)]
+)
 def test_surfaces_in_a_face_of_the_boundary_are_named(scenes, logged, height, expected):
-    """A floor in the plane of a face, and a cube that has a face there but lies elsewhere."""
+    """A floor in the plane of a face, one that offset rays skip (the image is 9 % too dark, blocks
+    have an error of their whole value), and a cube that has a face there but lies elsewhere.
+    """
     place = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], -90).scale(4)
     floor = {"type": "rectangle", "id": "floor", "to_world": place}
     beside = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([3, 0, 0])}
