@@ -100,8 +100,8 @@ SLIPS = (
     Mutant(
         "even directions without their own weights beside bright ones (directions)",
         "solvers/discrete_ordinates/incident.py",
-        "            angle[: len(plain)] *= weights * uniform\n",
-        "",
+        "        return np.where(is_even, angle * weights * uniform, angle)\n",
+        "        return angle\n",
         (SKIES,),
     ),
     Mutant(
