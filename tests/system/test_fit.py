@@ -10,6 +10,7 @@ import pytest
 
 from experiments.validation.gradients.cases import SUN, Case
 from experiments.validation.gradients.differences import first_key
+from mitsuba_irrcache.cli.fit import _image_files
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.fit import _roughness, fit
@@ -242,6 +243,14 @@ def test_the_command_fits_and_continues(folder, capsys):
     (folder / "out" / "sigma_t.vol").unlink()
     assert main([*common, "--resume"]) == 0
     np.testing.assert_array_equal(read_vol(folder / "out" / "sigma_t.vol")[0], values)
+
+
+def test_images_of_a_folder_are_sorted_by_numbers(tmp_path):
+    names = ["a.exr", "a2.png", "a2.exr", "a02b.exr", "a10.exr", "0.exr", "2.exr", "11.exr"]
+    for name in (*names, "notes.txt"):
+        (tmp_path / name).touch()
+    expected = ["0.exr", "2.exr", "11.exr", "a.exr", "a2.exr", "a2.png", "a02b.exr", "a10.exr"]
+    assert [path.name for path in _image_files([str(tmp_path)])] == expected
 
 
 def test_the_command_names_what_is_wrong(folder, capsys):
