@@ -20,7 +20,15 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients.fit_state import LOSSES, Result, Settings, View
+from mitsuba_irrcache.gradients.fit_state import (
+    LOSSES,
+    Range,
+    Ranges,
+    Result,
+    Settings,
+    View,
+    check_parameter,
+)
 from mitsuba_irrcache.io.scene_files import key_of
 from mitsuba_irrcache.machine.extras import require
 
@@ -32,8 +40,6 @@ DIRECTIONS = ((0.0, 32), (0.6, 64), (0.85, 128))
 LBFGS_DIRECTIONS = 64
 #: Adam: decay rates of both moments, epsilon, and ratio of the last step size to the first.
 DECAY, EPSILON, LAST_RATE = (0.9, 0.99), 1e-8, 0.1
-#: Optical depth of the scene's diagonal by which the extinction is scaled if the start is thinner.
-DEPTH = 4.0
 
 
 def fit(
@@ -80,7 +86,6 @@ class _Fit:
         self._report, self._every = report or (lambda result: None), every
         self._params = mi.traverse(scene)
         self._keys = {name: key_of(self._params, name) for name in names}
-        self._kinds = {name: type(self._params[key]) for name, key in self._keys.items()}
         if not views or not names:
             raise IrrcacheError("fit: give at least one view and one parameter.")
         integrator = scene.integrator()
@@ -91,9 +96,12 @@ class _Fit:
                 "gradients; use irrcache."
             )
         self._chooses_directions = has_cache and integrator.cache_spp == 0
+        for key in self._keys.values():
+            check_parameter(self._params, key, has_cache)
+        self._kinds = {name: type(self._params[key]) for name, key in self._keys.items()}
         first = {n: np.array(self._params[k], dtype=np.float32) for n, k in self._keys.items()}
-        self._bounds = {n: 1.0 if "albedo" in k.split(".") else np.inf for n, k in self._named()}
-        self._scales = {name: self._scale(name, value) for name, value in first.items()}
+        ranges = Ranges(scene, self._params, has_cache, settings.scale)
+        self._ranges = {name: ranges.of(key, first[name]) for name, key in self._named()}
         self.result = start or Result(0, first)
         if start is not None:
             self._check_start(start, first)
@@ -109,17 +117,6 @@ class _Fit:
 
     def _named(self) -> list[tuple[str, str]]:
         return list(self._keys.items())
-
-    def _scale(self, name: str, value: np.ndarray) -> float:
-        if np.isfinite(self._bounds[name]):
-            return self._bounds[name]
-        if self.settings.scale:
-            return self.settings.scale
-        largest = float(np.abs(value).max())
-        if "sigma_t" not in self._keys[name].split("."):
-            return largest or 1.0
-        box = self.scene.bbox()
-        return max(largest, DEPTH / float(dr.norm(box.max - box.min)))
 
     def _check_start(self, start: Result, first: dict[str, np.ndarray]) -> None:
         shapes = {name: value.shape for name, value in first.items()}
@@ -168,9 +165,9 @@ class _Fit:
         loss, gradient = float(np.array(total).item()), {}
         for name, leaf in leaves.items():
             gradient[name] = np.array(dr.grad(leaf), dtype=np.float64).reshape(values[name].shape)
-            roughness, change = _roughness(values[name] / self._scales[name])
+            roughness, change = _roughness(values[name] / self._ranges[name].scale)
             loss += self._smoothness * roughness
-            gradient[name] += self._smoothness / self._scales[name] * change
+            gradient[name] += self._smoothness / self._ranges[name].scale * change
         return loss, gradient
 
     def _held_out_error(self) -> float:
@@ -211,8 +208,8 @@ class _Fit:
                 LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * done))
             )
             for name, value in result.values.items():
-                step = self._adam_step(name, gradient[name] * self._scales[name])
-                changed = value - rate * self._scales[name] * step
+                step = self._adam_step(name, gradient[name] * self._ranges[name].scale)
+                changed = value - rate * self._ranges[name].scale * step
                 result.values[name] = self._within_bounds(name, changed).astype(np.float32)
             self._step_done(loss)
         return result
@@ -241,7 +238,7 @@ class _Fit:
         return [self._views[orders[n // len(self._views)][n % len(self._views)]] for n in numbers]
 
     def _within_bounds(self, name: str, value: np.ndarray) -> np.ndarray:
-        return np.clip(value, 0, self._bounds[name])
+        return np.clip(value, self._ranges[name].lower, self._ranges[name].upper)
 
     def with_lbfgs(self) -> Result:
         require("scipy", "volumes", "the method lbfgs")
@@ -252,7 +249,12 @@ class _Fit:
             self.scene.integrator().cache_spp = LBFGS_DIRECTIONS
         shapes = {name: value.shape for name, value in result.values.items()}
         ends = np.cumsum([0, *(value.size for value in result.values.values())])
-        scale = np.concatenate([np.full(v.size, self._scales[n]) for n, v in result.values.items()])
+
+        def of_each(number: Callable[[Range], float]) -> np.ndarray:
+            parts = [np.full(v.size, number(self._ranges[n])) for n, v in result.values.items()]
+            return np.concatenate(parts)
+
+        scale = of_each(lambda own: own.scale)
 
         def by_name(x: np.ndarray) -> dict[str, np.ndarray]:
             parts = (x[a:b] for a, b in pairwise(ends))
@@ -277,13 +279,9 @@ class _Fit:
         left = settings.steps - result.step
         if left > 0:
             x = np.concatenate([v.ravel() for v in result.values.values()]) / scale
-            upper = np.concatenate(
-                [
-                    np.full(v.size, self._bounds[n] / self._scales[n])
-                    for n, v in result.values.items()
-                ]
-            )
-            bounds = list(zip(np.zeros(len(x)), upper, strict=True))
+            lower = of_each(lambda own: own.lower / own.scale)
+            upper = of_each(lambda own: own.upper / own.scale)
+            bounds = list(zip(lower, upper, strict=True))
             # The loss is smooth to single precision.
             options = {"maxiter": left, "maxfun": 4 * left + 20, "gtol": 0, "ftol": 1e-7}
             minimize(

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.validation.gradients.cases import SUN, Case
+from experiments.validation.gradients.cases import POINT, SUN, Case
 from experiments.validation.gradients.differences import first_key
 from mitsuba_irrcache.cli.fit import _image_files
 from mitsuba_irrcache.cli.main import main
@@ -23,8 +23,8 @@ CASE = Case(data=8, cache=8, depth=0.5)
 ORIGINS = ([5.0, 1.0, 0.0], [0.0, 2.0, 5.0], [-4.0, 1.0, -3.0], [1.0, -4.0, 3.0])
 
 
-def sensors() -> list[mi.Sensor]:
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+def sensors(size: int = 16) -> list[mi.Sensor]:
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
     found = []
     for origin in ORIGINS:
         look = mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0])
@@ -108,6 +108,49 @@ def test_a_fit_of_a_medium_that_scatters_forwards(mono):
     losses, errors = np.array(result.history)[:, 1:].T
     assert losses[-1] < 0.1 * losses[0]
     assert errors[-1] < 0.5 * errors[0]
+
+
+# Parameters other than grids: a few numbers, with small images
+
+
+def fitted(case: Case, key: str, truth: object, settings: Settings, **properties) -> np.ndarray:
+    """Fit a parameter to small images of the scene with the ``truth``."""
+    scene = case.load(**properties)
+    params = mi.traverse(scene)
+    start = type(params[key])(params[key])
+    params[key] = type(params[key])(truth)
+    params.update()
+    seen = [View(s, np.array(mi.render(scene, sensor=s, spp=64))) for s in sensors(8)]
+    params[key] = start
+    params.update()
+    return fit(scene, seen, [key], settings).values[key].ravel()
+
+
+def test_a_position_is_found_across_0(mono):
+    """The first step must not carry the light into the medium, either."""
+    pytest.importorskip("scipy")
+    point = {**POINT, "position": [0.3, 2.5, 0.2]}
+    case = replace(CASE, data=6, cache=6, emitters=lambda: {"point": point})
+    truth, settings = [-0.4, 2.2, -0.3], Settings(steps=9)
+    found = fitted(case, "point.position", truth, settings, cache_spp=16)
+    assert np.abs(found - truth).max() < 0.2
+
+
+def test_backward_scattering_is_found(mono):
+    pytest.importorskip("scipy")
+    case = replace(CASE, data=6, cache=6, g=0.2, emitters=lambda: {"sun": SUN})
+    key, settings = "shape.interior_medium.phase_function.g", Settings(steps=2)
+    found = fitted(case, key, -0.3, settings, cache_spp=16)
+    assert found[0] == pytest.approx(-0.3, abs=0.1)
+
+
+def test_reflectances_stay_below_1(mono):
+    """Images that are brighter than any floor."""
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+    case = replace(CASE, data=4, depth=0.1, objects=lambda: {"floor": floor})
+    key, settings = "floor.bsdf.reflectance.value", Settings(steps=3)
+    found = fitted(case, key, 1.5, settings, type="prbvolpath", max_depth=2)
+    assert found[0] == 1
 
 
 def test_a_fit_continues_where_it_stopped(mono, tmp_path):
