@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
             f"--images names {len(files)} image(s), but the scene has {len(sensors)} sensor(s); "
             "give one for each, in the same order."
         )
-    views = [View(sensor, _pixels(file)) for sensor, file in zip(sensors, files, strict=True)]
+    views = [View(s, _pixels(f), f'image "{f}"') for s, f in zip(sensors, files, strict=True)]
     fitted = len(views) - args.held_out
     if fitted < 1:
         raise IrrcacheError(
@@ -192,10 +192,15 @@ def _natural(path: Path) -> tuple:
 
 
 def _pixels(file: Path) -> np.ndarray:
-    """Return linear radiance (height, width, 3), or 1 channel in a monochromatic variant."""
-    form = mi.Bitmap.PixelFormat.Y if mi.is_monochromatic else mi.Bitmap.PixelFormat.RGB
+    """Return linear radiance (height, width, 3), or 1 channel in a monochromatic variant and of
+    grey images.
+    """
+    forms = mi.Bitmap.PixelFormat
     try:
-        bitmap = mi.Bitmap(str(file)).convert(form, mi.Struct.Type.Float32, srgb_gamma=False)
+        bitmap = mi.Bitmap(str(file))
+        is_grey = mi.is_monochromatic or bitmap.pixel_format() in (forms.Y, forms.YA)
+        form = forms.Y if is_grey else forms.RGB
+        bitmap = bitmap.convert(form, mi.Struct.Type.Float32, srgb_gamma=False)
     except RuntimeError as error:
         raise IrrcacheError(f'cannot read the image "{file}": {error}') from error
     image = np.array(bitmap)

@@ -28,6 +28,8 @@ from mitsuba_irrcache.gradients.fit_state import (
     Settings,
     View,
     check_parameter,
+    comparable_colours,
+    in_colours,
 )
 from mitsuba_irrcache.io.scene_files import key_of
 from mitsuba_irrcache.machine.extras import require
@@ -112,7 +114,7 @@ class _Fit:
         self._held_out = [self._target(view) for view in held_out]
         # Losses have the units of these.
         units = {"l2": np.square, "l1": np.abs, "relative": np.ones_like}[settings.loss]
-        level = np.mean([units(np.asarray(view.image, np.float64)).mean() for view in views])
+        level = np.mean([units(np.array(image, np.float64)).mean() for _, image in self._views])
         self._smoothness = settings.smoothness * float(level)
 
     def _named(self) -> list[tuple[str, str]]:
@@ -125,16 +127,30 @@ class _Fit:
             raise IrrcacheError(f"fit: the start has parameters {found}, the scene has {shapes}.")
 
     def _target(self, view: View) -> tuple[mi.Sensor, mi.TensorXf]:
-        size = view.sensor.film().crop_size()
+        film = view.sensor.film()
+        size = film.crop_size()
         image = np.asarray(view.image, dtype=np.float32)
         if image.ndim != 3 or image.shape[:2] != (int(size.y), int(size.x)):
             raise IrrcacheError(
-                f"fit: an image has shape {image.shape}, but the film of its sensor is "
+                f"fit: {view.name} has shape {image.shape}, but the film of its sensor is "
                 f"{int(size.x)} x {int(size.y)} pixels; scale one of them."
             )
         if not np.isfinite(image).all():
-            raise IrrcacheError("fit: an image has pixels that are NaN or infinite; clean it.")
-        return view.sensor, mi.TensorXf(image)
+            raise IrrcacheError(f"fit: {view.name} has pixels that are NaN or infinite; clean it.")
+        if "pixel_format = xyz" in str(film):  # no other sign of it
+            raise IrrcacheError(
+                f"fit: {view.name} is compared with a film whose pixel_format is xyz or xyza, but "
+                'images are RGB or luminance; set pixel_format to "rgb" or "luminance".'
+            )
+        film.prepare([])
+        count = film.develop().shape[2]
+        colours = comparable_colours(count, image.shape[2])
+        if not colours:
+            raise IrrcacheError(
+                f"fit: {view.name} has {image.shape[2]} channel(s), but the film of its sensor has "
+                f"{count}; both need 1 (luminance) or 3 (RGB), or one more for alpha."
+            )
+        return view.sensor, in_colours(mi.TensorXf(image), colours)
 
     # Images
 
@@ -160,7 +176,7 @@ class _Fit:
         for number, (sensor, target) in enumerate(views):
             own = (seed * len(views) + number) & 0x7FFFFFFF
             image = mi.render(self.scene, self._params, sensor=sensor, spp=settings.spp, seed=own)
-            total += dr.mean(function(_colours(image, target), target)) / len(views)
+            total += dr.mean(function(in_colours(image, target.shape[2]), target)) / len(views)
         dr.backward(total)
         loss, gradient = float(np.array(total).item()), {}
         for name, leaf in leaves.items():
@@ -178,7 +194,7 @@ class _Fit:
         for sensor, target in self._held_out:
             image = mi.render(self.scene, sensor=sensor, spp=self.settings.spp)
             target = np.array(target, dtype=np.float64)
-            square += np.mean(np.square(np.array(_colours(image, target)) - target))
+            square += np.mean(np.square(np.array(in_colours(image, target.shape[2])) - target))
             mean += np.mean(target)
         count = len(self._held_out)
         return float(np.sqrt(square / count) / max(mean / count, 1e-30))
@@ -304,11 +320,6 @@ def _roughness(values: np.ndarray) -> tuple[float, np.ndarray]:
         ends[0][axis], ends[1][axis] = (1, 0), (0, 1)
         gradient += 2 * (np.pad(difference, ends[0]) - np.pad(difference, ends[1]))
     return total, gradient
-
-
-def _colours(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Return the channels of an image that the target has: those without alpha."""
-    return image if image.shape[2] == target.shape[2] else image[:, :, : target.shape[2]]
 
 
 def _check_finite(loss: float, gradient: dict[str, np.ndarray], step: int) -> None:

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError, reason
+from mitsuba_irrcache.gradients.film import LUMINANCE
 from mitsuba_irrcache.gradients.parameters import MEAN_COSINE, SIGMA_T
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.media.bake import children
@@ -20,6 +21,8 @@ from mitsuba_irrcache.media.phase import LARGEST_PEAK, MAX_ORDER, MAX_TAIL, MAX_
 
 #: Radiance below which errors of the loss ``relative`` are absolute.
 DARK = 0.1
+#: Numbers of colours of images by their numbers of channels, which include alpha.
+COLOURS = {1: 1, 2: 1, 3: 3, 4: 3}
 #: Optical depth of the scene's diagonal by which the extinction is scaled if the start is thinner.
 DEPTH = 4.0
 #: Names of volumes and textures, in the media and BSDFs that have them, of values from 0 to 1.
@@ -52,10 +55,33 @@ METHODS = ("adam", "lbfgs")
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A reference image (height, width, channel) of linear radiance, and its sensor."""
+    """A reference image (height, width, channel) of linear radiance, and its sensor.
+
+    Channels are luminance or RGB, and alpha if there is one more; where one of image and film has
+    luminance only, luminances are compared. Errors call the image ``name``.
+    """
 
     sensor: mi.Sensor
     image: np.ndarray
+    name: str = "an image"
+
+
+def comparable_colours(film: int, image: int) -> int:
+    """Return the number of channels in which images are compared, given those of the ``film`` and
+    of the reference ``image``; 0 if they are not comparable.
+    """
+    if film == image:
+        return image
+    return min(COLOURS.get(film, 0), COLOURS.get(image, 0))
+
+
+def in_colours(image: mi.TensorXf, count: int) -> mi.TensorXf:
+    """Return the first ``count`` channels of an image, or the luminance of an RGB image."""
+    if image.shape[2] == count:
+        return image
+    if count == 1 and COLOURS[image.shape[2]] == 3:
+        return sum(share * image[:, :, i : i + 1] for i, share in enumerate(LUMINANCE))
+    return image[:, :, :count]
 
 
 @dataclass(frozen=True)

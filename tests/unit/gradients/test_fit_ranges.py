@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf
+from math import inf, nan
 
 import mitsuba as mi
 import numpy as np
@@ -19,6 +19,8 @@ from mitsuba_irrcache.gradients.fit_state import (
     Range,
     Ranges,
     check_parameter,
+    comparable_colours,
+    in_colours,
 )
 
 
@@ -133,3 +135,19 @@ def test_a_start_outside_of_the_bounds_is_refused(rgb):
     scene = Case(data=4, cache=4, g=0.9).load()
     with pytest.raises(IrrcacheError, match=r'phase_function.g" starts at values from 0.9 .*0.844'):
         found(scene, "phase_function.g")
+
+
+@pytest.mark.parametrize(
+    ("film", "image", "expected"),
+    [(1, 1, 1), (4, 4, 4), (3, 4, 3), (1, 3, 1), (2, 4, 1), (4, 2, 1), (5, 5, 5), (3, 5, 0)],
+)
+def test_comparable_colours(film, image, expected):
+    assert comparable_colours(film, image) == expected
+
+
+def test_the_luminance_of_an_image(rgb):
+    image = mi.TensorXf(np.array([[[0.5, 0.25, 2.0, nan]]], np.float32))
+    grey = np.array(in_colours(image, 1))
+    assert grey.shape == (1, 1, 1)
+    assert grey.item() == pytest.approx(float(mi.luminance(mi.Color3f(0.5, 0.25, 2.0))[0]), 1e-5)
+    assert np.array(in_colours(image, 3)).tolist() == [[[0.5, 0.25, 2.0]]]
