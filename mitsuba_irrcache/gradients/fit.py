@@ -104,6 +104,7 @@ class _Fit:
         first = {n: np.array(self._params[k], dtype=np.float32) for n, k in self._keys.items()}
         ranges = Ranges(scene, self._params, has_cache, settings.scale)
         self._ranges = {name: ranges.of(key, first[name]) for name, key in self._named()}
+        first = {name: self._ranges[name].nearest(value) for name, value in first.items()}
         self.result = start or Result(0, first)
         if start is not None:
             self._check_start(start, first)
@@ -226,7 +227,7 @@ class _Fit:
             for name, value in result.values.items():
                 step = self._adam_step(name, gradient[name] * self._ranges[name].scale)
                 changed = value - rate * self._ranges[name].scale * step
-                result.values[name] = self._within_bounds(name, changed).astype(np.float32)
+                result.values[name] = self._ranges[name].nearest(changed)
             self._step_done(loss)
         return result
 
@@ -253,9 +254,6 @@ class _Fit:
                 orders[turn] = rng.permutation(len(self._views))
         return [self._views[orders[n // len(self._views)][n % len(self._views)]] for n in numbers]
 
-    def _within_bounds(self, name: str, value: np.ndarray) -> np.ndarray:
-        return np.clip(value, self._ranges[name].lower, self._ranges[name].upper)
-
     def with_lbfgs(self) -> Result:
         require("scipy", "volumes", "the method lbfgs")
         from scipy.optimize import minimize
@@ -275,7 +273,7 @@ class _Fit:
         def by_name(x: np.ndarray) -> dict[str, np.ndarray]:
             parts = (x[a:b] for a, b in pairwise(ends))
             return {
-                name: self._within_bounds(name, part.reshape(shape)).astype(np.float32)
+                name: self._ranges[name].nearest(part.reshape(shape))
                 for (name, shape), part in zip(shapes.items(), parts, strict=True)
             }
 

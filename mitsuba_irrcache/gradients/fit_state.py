@@ -38,6 +38,8 @@ SHARPEST = 0.99
 #: differences by g in its gradients.
 BACKWARDS = 0.01 - MAX_TAIL ** (1 / (MAX_ORDER + 1))
 FORWARDS = LARGEST_PEAK ** (1 / (MAX_TRUNCATED_ORDER + 1)) - 0.01
+#: Smallest |g| with irrcache, which has no gradient by g where a medium scatters isotropically.
+ISOTROPIC = 1e-4
 #: Scale of g, about the length of the first step of L-BFGS. Larger ones often end at a bound.
 MEAN_COSINE_SCALE = 0.25
 #: Parameters of shapes that are no values of a material, and move what is visible.
@@ -86,11 +88,20 @@ def in_colours(image: mi.TensorXf, count: int) -> mi.TensorXf:
 
 @dataclass(frozen=True)
 class Range:
-    """The bounds between which a parameter is fitted, and the ``scale`` by which it is divided."""
+    """The bounds between which a parameter is fitted, the ``scale`` by which it is divided, and its
+    ``smallest`` magnitude.
+    """
 
     lower: float
     upper: float
     scale: float
+    smallest: float = 0.0
+
+    def nearest(self, value: np.ndarray) -> np.ndarray:
+        """Return the values in the range that are nearest to these."""
+        found = np.clip(value, self.lower, self.upper)
+        tiny = np.copysign(self.smallest, found)
+        return np.where(np.abs(found) < self.smallest, tiny, found).astype(np.float32)
 
 
 class Ranges:
@@ -140,8 +151,9 @@ class Ranges:
         node, last = self._params.properties[key][2], key.rpartition(".")[2]
         names = self._names.get(node, set())
         if node.class_name() == "HGPhaseFunction" and last == MEAN_COSINE:
-            own = (BACKWARDS, FORWARDS) if self._has_cache else (-SHARPEST, SHARPEST)
-            return Range(*own, MEAN_COSINE_SCALE)
+            if not self._has_cache:
+                return Range(-SHARPEST, SHARPEST, MEAN_COSINE_SCALE)
+            return Range(BACKWARDS, FORWARDS, MEAN_COSINE_SCALE, ISOTROPIC)
         if last == "position":
             return Range(-math.inf, math.inf, self._distance(value))
         if names.intersection(FRACTIONS):

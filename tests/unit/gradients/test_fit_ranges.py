@@ -99,6 +99,15 @@ def test_irrcache_renders_at_the_bounds_of_g(mono):
         assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
 
 
+def test_the_nearest_values_in_a_range():
+    own = Range(-0.5, 1.0, 1.0, smallest=0.25)
+    values = np.array([-9, -0.3, -0.1, 0, 0.1, 0.5, 9], np.float32)
+    assert (
+        own.nearest(values).tolist() == np.float32([-0.5, -0.3, -0.25, 0.25, 0.25, 0.5, 1]).tolist()
+    )
+    assert own.nearest(values).dtype == np.float32
+
+
 def test_scales(scene):
     assert found(scene, "albedo.data", scale=7.0).scale == 1
     assert found(scene, "phase_function.g", scale=7.0).scale == MEAN_COSINE_SCALE
