@@ -38,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="scene XML with the start volume and a sensor for each image")
     parser.add_argument(
         "--images", nargs="+", required=True, metavar="FILE",
-        help="images in the order of the sensors, or a folder of them, by name; those with 8 bits "
-        "are taken to be sRGB",
+        help="images in the order of the sensors, or a folder of them, sorted by name and by the "
+        "numbers in names; those with 8 bits are taken to be sRGB",
     )  # fmt: skip
     parser.add_argument(
         "-o", "--output", required=True, metavar="FOLDER",
@@ -47,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "-p", "--parameter", action="append", metavar="NAME",
-        help="sigma_t, albedo, emission, the id of an emitter, or a key of mi.traverse(scene); "
-        "repeatable (default: sigma_t)",
+        help="sigma_t, albedo, emission, the id of an emitter, or a key of mi.traverse(scene) or "
+        "its end, such as g; repeatable (default: sigma_t)",
     )  # fmt: skip
     parser.add_argument(
         "--held-out", type=whole(0), default=0, metavar="N",
@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
             f"--images names {len(files)} image(s), but the scene has {len(sensors)} sensor(s); "
             "give one for each, in the same order."
         )
-    views = [View(sensor, _pixels(file)) for sensor, file in zip(sensors, files, strict=True)]
+    views = [View(s, _pixels(f), f'image "{f}"') for s, f in zip(sensors, files, strict=True)]
     fitted = len(views) - args.held_out
     if fitted < 1:
         raise IrrcacheError(
@@ -170,11 +170,12 @@ class _Report:
 
 
 def _image_files(given: list[str]) -> list[Path]:
-    """Return the image files; those of a folder are sorted by name."""
+    """Return the image files; those of a folder in their natural order."""
     paths = [Path(name) for name in given]
     if len(paths) == 1 and paths[0].is_dir():
         folder = paths[0]
-        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGES)
+        paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
+        paths.sort(key=_natural)
         if not paths:
             raise IrrcacheError(f'the folder "{folder}" has no images ({", ".join(IMAGES)}).')
     missing = [path for path in paths if not path.is_file()]
@@ -183,11 +184,23 @@ def _image_files(given: list[str]) -> list[Path]:
     return paths
 
 
+def _natural(path: Path) -> tuple:
+    """Return a key that sorts numbers in names by their values: 2.exr before 10.exr."""
+    # The parts of a name are text and digits in turn.
+    parts = re.split(r"([0-9]+)", path.stem)
+    return [int(part) if odd % 2 else part for odd, part in enumerate(parts)], path.name
+
+
 def _pixels(file: Path) -> np.ndarray:
-    """Return linear radiance (height, width, 3), or 1 channel in a monochromatic variant."""
-    form = mi.Bitmap.PixelFormat.Y if mi.is_monochromatic else mi.Bitmap.PixelFormat.RGB
+    """Return linear radiance (height, width, 3), or 1 channel in a monochromatic variant and of
+    grey images.
+    """
+    forms = mi.Bitmap.PixelFormat
     try:
-        bitmap = mi.Bitmap(str(file)).convert(form, mi.Struct.Type.Float32, srgb_gamma=False)
+        bitmap = mi.Bitmap(str(file))
+        is_grey = mi.is_monochromatic or bitmap.pixel_format() in (forms.Y, forms.YA)
+        form = forms.Y if is_grey else forms.RGB
+        bitmap = bitmap.convert(form, mi.Struct.Type.Float32, srgb_gamma=False)
     except RuntimeError as error:
         raise IrrcacheError(f'cannot read the image "{file}": {error}') from error
     image = np.array(bitmap)

@@ -20,7 +20,17 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients.fit_state import LOSSES, Result, Settings, View
+from mitsuba_irrcache.gradients.fit_state import (
+    LOSSES,
+    Range,
+    Ranges,
+    Result,
+    Settings,
+    View,
+    check_parameter,
+    comparable_colours,
+    in_colours,
+)
 from mitsuba_irrcache.io.scene_files import key_of
 from mitsuba_irrcache.machine.extras import require
 
@@ -32,8 +42,6 @@ DIRECTIONS = ((0.0, 32), (0.6, 64), (0.85, 128))
 LBFGS_DIRECTIONS = 64
 #: Adam: decay rates of both moments, epsilon, and ratio of the last step size to the first.
 DECAY, EPSILON, LAST_RATE = (0.9, 0.99), 1e-8, 0.1
-#: Optical depth of the scene's diagonal by which the extinction is scaled if the start is thinner.
-DEPTH = 4.0
 
 
 def fit(
@@ -80,7 +88,6 @@ class _Fit:
         self._report, self._every = report or (lambda result: None), every
         self._params = mi.traverse(scene)
         self._keys = {name: key_of(self._params, name) for name in names}
-        self._kinds = {name: type(self._params[key]) for name, key in self._keys.items()}
         if not views or not names:
             raise IrrcacheError("fit: give at least one view and one parameter.")
         integrator = scene.integrator()
@@ -91,9 +98,13 @@ class _Fit:
                 "gradients; use irrcache."
             )
         self._chooses_directions = has_cache and integrator.cache_spp == 0
+        for key in self._keys.values():
+            check_parameter(self._params, key, has_cache)
+        self._kinds = {name: type(self._params[key]) for name, key in self._keys.items()}
         first = {n: np.array(self._params[k], dtype=np.float32) for n, k in self._keys.items()}
-        self._bounds = {n: 1.0 if "albedo" in k.split(".") else np.inf for n, k in self._named()}
-        self._scales = {name: self._scale(name, value) for name, value in first.items()}
+        ranges = Ranges(scene, self._params, has_cache, settings.scale)
+        self._ranges = {name: ranges.of(key, first[name]) for name, key in self._named()}
+        first = {name: self._ranges[name].nearest(value) for name, value in first.items()}
         self.result = start or Result(0, first)
         if start is not None:
             self._check_start(start, first)
@@ -104,22 +115,11 @@ class _Fit:
         self._held_out = [self._target(view) for view in held_out]
         # Losses have the units of these.
         units = {"l2": np.square, "l1": np.abs, "relative": np.ones_like}[settings.loss]
-        level = np.mean([units(np.asarray(view.image, np.float64)).mean() for view in views])
+        level = np.mean([units(np.array(image, np.float64)).mean() for _, image in self._views])
         self._smoothness = settings.smoothness * float(level)
 
     def _named(self) -> list[tuple[str, str]]:
         return list(self._keys.items())
-
-    def _scale(self, name: str, value: np.ndarray) -> float:
-        if np.isfinite(self._bounds[name]):
-            return self._bounds[name]
-        if self.settings.scale:
-            return self.settings.scale
-        largest = float(np.abs(value).max())
-        if "sigma_t" not in self._keys[name].split("."):
-            return largest or 1.0
-        box = self.scene.bbox()
-        return max(largest, DEPTH / float(dr.norm(box.max - box.min)))
 
     def _check_start(self, start: Result, first: dict[str, np.ndarray]) -> None:
         shapes = {name: value.shape for name, value in first.items()}
@@ -128,16 +128,30 @@ class _Fit:
             raise IrrcacheError(f"fit: the start has parameters {found}, the scene has {shapes}.")
 
     def _target(self, view: View) -> tuple[mi.Sensor, mi.TensorXf]:
-        size = view.sensor.film().crop_size()
+        film = view.sensor.film()
+        size = film.crop_size()
         image = np.asarray(view.image, dtype=np.float32)
         if image.ndim != 3 or image.shape[:2] != (int(size.y), int(size.x)):
             raise IrrcacheError(
-                f"fit: an image has shape {image.shape}, but the film of its sensor is "
+                f"fit: {view.name} has shape {image.shape}, but the film of its sensor is "
                 f"{int(size.x)} x {int(size.y)} pixels; scale one of them."
             )
         if not np.isfinite(image).all():
-            raise IrrcacheError("fit: an image has pixels that are NaN or infinite; clean it.")
-        return view.sensor, mi.TensorXf(image)
+            raise IrrcacheError(f"fit: {view.name} has pixels that are NaN or infinite; clean it.")
+        if "pixel_format = xyz" in str(film):  # no other sign of it
+            raise IrrcacheError(
+                f"fit: {view.name} is compared with a film whose pixel_format is xyz or xyza, but "
+                'images are RGB or luminance; set pixel_format to "rgb" or "luminance".'
+            )
+        film.prepare([])
+        count = film.develop().shape[2]
+        colours = comparable_colours(count, image.shape[2])
+        if not colours:
+            raise IrrcacheError(
+                f"fit: {view.name} has {image.shape[2]} channel(s), but the film of its sensor has "
+                f"{count}; both need 1 (luminance) or 3 (RGB), or one more for alpha."
+            )
+        return view.sensor, in_colours(mi.TensorXf(image), colours)
 
     # Images
 
@@ -163,14 +177,14 @@ class _Fit:
         for number, (sensor, target) in enumerate(views):
             own = (seed * len(views) + number) & 0x7FFFFFFF
             image = mi.render(self.scene, self._params, sensor=sensor, spp=settings.spp, seed=own)
-            total += dr.mean(function(_colours(image, target), target)) / len(views)
+            total += dr.mean(function(in_colours(image, target.shape[2]), target)) / len(views)
         dr.backward(total)
         loss, gradient = float(np.array(total).item()), {}
         for name, leaf in leaves.items():
             gradient[name] = np.array(dr.grad(leaf), dtype=np.float64).reshape(values[name].shape)
-            roughness, change = _roughness(values[name] / self._scales[name])
+            roughness, change = _roughness(values[name] / self._ranges[name].scale)
             loss += self._smoothness * roughness
-            gradient[name] += self._smoothness / self._scales[name] * change
+            gradient[name] += self._smoothness / self._ranges[name].scale * change
         return loss, gradient
 
     def _held_out_error(self) -> float:
@@ -181,7 +195,7 @@ class _Fit:
         for sensor, target in self._held_out:
             image = mi.render(self.scene, sensor=sensor, spp=self.settings.spp)
             target = np.array(target, dtype=np.float64)
-            square += np.mean(np.square(np.array(_colours(image, target)) - target))
+            square += np.mean(np.square(np.array(in_colours(image, target.shape[2])) - target))
             mean += np.mean(target)
         count = len(self._held_out)
         return float(np.sqrt(square / count) / max(mean / count, 1e-30))
@@ -211,9 +225,9 @@ class _Fit:
                 LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * done))
             )
             for name, value in result.values.items():
-                step = self._adam_step(name, gradient[name] * self._scales[name])
-                changed = value - rate * self._scales[name] * step
-                result.values[name] = self._within_bounds(name, changed).astype(np.float32)
+                step = self._adam_step(name, gradient[name] * self._ranges[name].scale)
+                changed = value - rate * self._ranges[name].scale * step
+                result.values[name] = self._ranges[name].nearest(changed)
             self._step_done(loss)
         return result
 
@@ -240,9 +254,6 @@ class _Fit:
                 orders[turn] = rng.permutation(len(self._views))
         return [self._views[orders[n // len(self._views)][n % len(self._views)]] for n in numbers]
 
-    def _within_bounds(self, name: str, value: np.ndarray) -> np.ndarray:
-        return np.clip(value, 0, self._bounds[name])
-
     def with_lbfgs(self) -> Result:
         require("scipy", "volumes", "the method lbfgs")
         from scipy.optimize import minimize
@@ -252,12 +263,17 @@ class _Fit:
             self.scene.integrator().cache_spp = LBFGS_DIRECTIONS
         shapes = {name: value.shape for name, value in result.values.items()}
         ends = np.cumsum([0, *(value.size for value in result.values.values())])
-        scale = np.concatenate([np.full(v.size, self._scales[n]) for n, v in result.values.items()])
+
+        def of_each(number: Callable[[Range], float]) -> np.ndarray:
+            parts = [np.full(v.size, number(self._ranges[n])) for n, v in result.values.items()]
+            return np.concatenate(parts)
+
+        scale = of_each(lambda own: own.scale)
 
         def by_name(x: np.ndarray) -> dict[str, np.ndarray]:
             parts = (x[a:b] for a, b in pairwise(ends))
             return {
-                name: self._within_bounds(name, part.reshape(shape)).astype(np.float32)
+                name: self._ranges[name].nearest(part.reshape(shape))
                 for (name, shape), part in zip(shapes.items(), parts, strict=True)
             }
 
@@ -277,13 +293,9 @@ class _Fit:
         left = settings.steps - result.step
         if left > 0:
             x = np.concatenate([v.ravel() for v in result.values.values()]) / scale
-            upper = np.concatenate(
-                [
-                    np.full(v.size, self._bounds[n] / self._scales[n])
-                    for n, v in result.values.items()
-                ]
-            )
-            bounds = list(zip(np.zeros(len(x)), upper, strict=True))
+            lower = of_each(lambda own: own.lower / own.scale)
+            upper = of_each(lambda own: own.upper / own.scale)
+            bounds = list(zip(lower, upper, strict=True))
             # The loss is smooth to single precision.
             options = {"maxiter": left, "maxfun": 4 * left + 20, "gtol": 0, "ftol": 1e-7}
             minimize(
@@ -306,11 +318,6 @@ def _roughness(values: np.ndarray) -> tuple[float, np.ndarray]:
         ends[0][axis], ends[1][axis] = (1, 0), (0, 1)
         gradient += 2 * (np.pad(difference, ends[0]) - np.pad(difference, ends[1]))
     return total, gradient
-
-
-def _colours(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Return the channels of an image that the target has: those without alpha."""
-    return image if image.shape[2] == target.shape[2] else image[:, :, : target.shape[2]]
 
 
 def _check_finite(loss: float, gradient: dict[str, np.ndarray], step: int) -> None:

@@ -382,19 +382,24 @@ def has_cache(scene: mi.Scene) -> bool:
 
 
 def key_of(params: mi.SceneParameters, name: str) -> str:
-    """Return the key in ``params`` that ``name`` abbreviates: the key itself, or a component of it
-    between dots that occurs in only one key of an array, such as ``sigma_t``, ``albedo``,
-    ``emission`` or the id of an emitter.
+    """Return the key in ``params`` that ``name`` abbreviates: the key itself, the end of only one
+    key, such as ``g`` or ``phase_function.g``, or a component of it between dots that occurs in
+    only one key of an array, such as ``sigma_t``, ``albedo``, ``emission`` or the id of an emitter.
 
     Raises IrrcacheError if no key, or more than one, matches.
     """
-    arrays = [k for k in params.keys() if k.endswith((".data", ".value")) and name in k.split(".")]
     if name in params.keys():
         return name
-    if len(arrays) != 1:
-        found = ", ".join(f'"{key}"' for key in arrays) or "none"
+
+    def is_meant(key: str) -> bool:
+        is_array = key.endswith((".data", ".value"))
+        return key.endswith(f".{name}") or (is_array and f".{name}." in f".{key}")
+
+    found = [key for key in params.keys() if is_meant(key)]
+    if len(found) != 1:
+        listed = ", ".join(f'"{key}"' for key in found) or "none"
         raise IrrcacheError(
-            f'"{name}" must be a key of mi.traverse(scene), or stand in exactly one that ends '
-            f'in "data" or "value"; found: {found}.'
+            f'"{name}" must be a key of mi.traverse(scene), the end of exactly one, or stand in '
+            f'exactly one that ends in "data" or "value"; found: {listed}.'
         )
-    return arrays[0]
+    return found[0]

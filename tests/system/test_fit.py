@@ -8,8 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.validation.gradients.cases import SUN, Case
+from experiments.validation.gradients.cases import POINT, SKY, SUN, Case
 from experiments.validation.gradients.differences import first_key
+from mitsuba_irrcache.cli.fit import _image_files, _pixels
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.fit import _roughness, fit
@@ -22,8 +23,9 @@ CASE = Case(data=8, cache=8, depth=0.5)
 ORIGINS = ([5.0, 1.0, 0.0], [0.0, 2.0, 5.0], [-4.0, 1.0, -3.0], [1.0, -4.0, 3.0])
 
 
-def sensors() -> list[mi.Sensor]:
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+def sensors(size: int = 16, pixels: str = "rgb") -> list[mi.Sensor]:
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": pixels}
+    film["rfilter"] = {"type": "box"}
     found = []
     for origin in ORIGINS:
         look = mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0])
@@ -109,6 +111,50 @@ def test_a_fit_of_a_medium_that_scatters_forwards(mono):
     assert errors[-1] < 0.5 * errors[0]
 
 
+# Parameters other than grids: a few numbers, with small images
+
+
+def fitted(case: Case, key: str, truth: object, settings: Settings, **properties) -> np.ndarray:
+    """Fit a parameter to small images of the scene with the ``truth``."""
+    scene = case.load(**properties)
+    params = mi.traverse(scene)
+    start = type(params[key])(params[key])
+    params[key] = type(params[key])(truth)
+    params.update()
+    seen = [View(s, np.array(mi.render(scene, sensor=s, spp=64))) for s in sensors(8)]
+    params[key] = start
+    params.update()
+    return fit(scene, seen, [key], settings).values[key].ravel()
+
+
+def test_a_position_is_found_across_0(mono):
+    """The first step must not carry the light into the medium, either."""
+    pytest.importorskip("scipy")
+    point = {**POINT, "position": [0.3, 2.5, 0.2]}
+    case = replace(CASE, data=6, cache=6, emitters=lambda: {"point": point})
+    truth, settings = [-0.4, 2.2, -0.3], Settings(steps=9)
+    found = fitted(case, "point.position", truth, settings, cache_spp=16)
+    assert np.abs(found - truth).max() < 0.2
+
+
+def test_backward_scattering_is_found(mono):
+    """From isotropic scattering, of which irrcache has no gradient."""
+    pytest.importorskip("scipy")
+    case = replace(CASE, data=6, cache=6, g=0.0, emitters=lambda: {"sun": SUN})
+    key, settings = "shape.interior_medium.phase_function.g", Settings(steps=2)
+    found = fitted(case, key, -0.3, settings, cache_spp=16)
+    assert found[0] == pytest.approx(-0.3, abs=0.1)
+
+
+def test_reflectances_stay_below_1(mono):
+    """Images that are brighter than any floor."""
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+    case = replace(CASE, data=4, depth=0.1, objects=lambda: {"floor": floor})
+    key, settings = "floor.bsdf.reflectance.value", Settings(steps=3)
+    found = fitted(case, key, 1.5, settings, type="prbvolpath", max_depth=2)
+    assert found[0] == 1
+
+
 def test_a_fit_continues_where_it_stopped(mono, tmp_path):
     """The same bits as without a stop, with views in turn and the grid of the cache chosen once."""
     case = replace(CASE, data=6)
@@ -160,6 +206,29 @@ def test_smooth_volumes_are_preferred(mono):
     assert found[1] < 0.7 * found[0]
 
 
+# Channels
+
+
+@pytest.mark.parametrize(
+    ("film", "image"),
+    [("luminance", "rgb"), ("rgb", "luminance"), ("rgba", "luminance_alpha"), ("rgb", "rgba")],
+)
+def test_colours_are_compared_where_both_have_them(rgb, film, image):
+    """And luminances otherwise: the images of the truth have no loss."""
+    case = replace(CASE, data=4, cache=4, albedo=(0.5, 0.7, 0.9), emitters=lambda: {"sky": SKY})
+    scene = case.load(cache_spp=16)
+
+    def loss(factor: float) -> float:
+        seen = []
+        for own, other in zip(sensors(8, film), sensors(8, image), strict=True):
+            pixels = np.array(mi.render(scene, sensor=other, spp=4, seed=0))
+            seen.append(View(own, pixels * np.float32(factor)))
+        settings = Settings(steps=1, method="adam", smoothness=0.0)
+        return fit(case.load(cache_spp=16), seen[:1], ["sigma_t"], settings).history[0][1]
+
+    assert loss(1.0) < 1e-4 * loss(1.5)
+
+
 # What is refused
 
 
@@ -175,7 +244,13 @@ def test_wrong_arguments_are_named(mono):
     assert '"density" must be a key' in refused([view], ["density"])
     assert "at least one view" in refused([], ["sigma_t"])
     small = View(view.sensor, image[:8])
-    assert "shape (8, 16, 1), but the film of its sensor is 16 x 16" in refused([small], ["albedo"])
+    assert "an image has shape (8, 16, 1), but the film of its sensor is 16 x 16" in refused(
+        [small], ["albedo"]
+    )
+    more = View(view.sensor, np.ones((16, 16, 5)), 'image "5.exr"')
+    assert 'image "5.exr" has 5 channel(s), but the film of its sensor has 1' in refused(
+        [more], ["sigma_t"]
+    )
     bad = View(view.sensor, np.where(image > 0.5, np.nan, image))
     assert "NaN or infinite" in refused([bad], ["sigma_t"])
     assert "method is" in refused([view], ["sigma_t"], method="newton")
@@ -184,6 +259,12 @@ def test_wrong_arguments_are_named(mono):
     assert "rate must be above 0" in refused([view], ["sigma_t"], rate=0.0)
     scene = CASE.load(type="volpath")
     assert "integrator is VolumetricPathIntegrator" in refused([view], ["sigma_t"])
+
+
+def test_films_of_other_colours_are_refused(rgb):
+    view = View(sensors(8, "xyz")[0], np.ones((8, 8, 3)))
+    with pytest.raises(IrrcacheError, match="pixel_format is xyz or xyza, but images are RGB"):
+        fit(replace(CASE, data=4).load(), [view], ["sigma_t"])
 
 
 def test_parameters_without_gradients_are_refused_by_name(rgb):
@@ -244,6 +325,25 @@ def test_the_command_fits_and_continues(folder, capsys):
     np.testing.assert_array_equal(read_vol(folder / "out" / "sigma_t.vol")[0], values)
 
 
+def test_images_of_a_folder_are_sorted_by_numbers(tmp_path):
+    names = ["a.exr", "a2.png", "a2.exr", "a02b.exr", "a10.exr", "0.exr", "2.exr", "11.exr"]
+    for name in (*names, "notes.txt"):
+        (tmp_path / name).touch()
+    expected = ["0.exr", "2.exr", "11.exr", "a.exr", "a2.exr", "a2.png", "a02b.exr", "a10.exr"]
+    assert [path.name for path in _image_files([str(tmp_path)])] == expected
+
+
+def test_grey_images_have_one_channel(rgb, tmp_path):
+    for form, count in (("Y", 1), ("YA", 1), ("RGB", 3), ("RGBA", 3)):
+        file = tmp_path / f"{form}.png"
+        grey = mi.Bitmap(np.full((2, 2, 1), 0.5, np.float32))
+        grey.convert(getattr(mi.Bitmap.PixelFormat, form), mi.Struct.Type.UInt8, True).write(
+            str(file)
+        )
+        assert _pixels(file).shape == (2, 2, count)
+        assert _pixels(file)[..., 0] == pytest.approx(0.5, abs=0.01)
+
+
 def test_the_command_names_what_is_wrong(folder, capsys):
     def refused(*arguments: str) -> str:
         assert main(["fit", "scene.xml", "-o", "out", *arguments]) == 1
@@ -257,6 +357,8 @@ def test_the_command_names_what_is_wrong(folder, capsys):
     assert 'the folder "empty" has no images' in refused("--images", "empty")
     assert "leave at least one to fit" in refused("--images", "images", "--held-out", "4")
     assert "is no checkpoint of a fit" in refused("--images", "images", "--resume")
+    mi.Bitmap(np.ones((8, 8, 3), np.float32)).write("images/3.exr")
+    assert 'image "images/3.exr" has shape (8, 8, 3)' in refused("--images", "images")
     (folder / "images" / "3.exr").write_bytes(b"no image")
     assert 'cannot read the image "images/3.exr"' in refused("--images", "images")
     assert not list((folder / "out").iterdir())

@@ -9,6 +9,7 @@ import pytest
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.scene_files import (
     integrator_of,
+    key_of,
     load_scene,
     parse_integrator,
     scene_of_text,
@@ -194,3 +195,18 @@ def test_meshes_are_merged_unless_the_scene_loses_their_extent(tmp_path, far, sh
     box = scene.bbox()
     np.testing.assert_allclose([np.array(box.min), np.array(box.max)], [[-1] * 3, [6, 1, 1]])
     assert len(scene.shapes()) == shapes
+
+
+def test_keys_are_abbreviated(file):
+    """By their end, or by a component of the key of an array."""
+    phase = '<phase type="hg"> <float name="g" value="0.3"/> </phase>'
+    text = SCENE.replace("</medium>", f"{phase}</medium>")
+    params = mi.traverse(scene_of_text(text, folder=file.parent))
+    key = next(key for key in params.keys() if key.endswith("phase_function.g"))
+    assert {key_of(params, name) for name in ("g", "phase_function.g", key)} == {key}
+    key = next(key for key in params.keys() if key.endswith("sigma_t.data"))
+    assert {key_of(params, name) for name in ("sigma_t", "sigma_t.data", key)} == {key}
+    with pytest.raises(IrrcacheError, match=r'the end of exactly one.* found: ".*", "'):
+        key_of(params, "value")
+    with pytest.raises(IrrcacheError, match="found: none"):
+        key_of(params, "function.g")
