@@ -72,7 +72,7 @@ class _Segment:
         scattered, before: for each medium, the radiance that it scatters into the rays, and the
             transmittance of what is in front of it.
         through: transmittance of all media.
-        marches: of the media, without scattering where a path may not be longer.
+        parts: marches of the media, each with the paths for which it is used.
         end: the surface at the end.
         emitted: weighted radiance of emitters that the ray hits; ``emitter_weight`` its weight.
     """
@@ -87,7 +87,7 @@ class _Segment:
     scattered: list[mi.Spectrum]
     before: list[mi.Spectrum]
     through: mi.Spectrum
-    marches: list[CameraReplay]
+    parts: list[tuple[list[CameraReplay], mi.Bool]]
     end: mi.SurfaceInteraction3f
     emitted: mi.Spectrum
     emitter_weight: mi.Spectrum
@@ -164,17 +164,30 @@ class MarchedMedia:
             hits.append(hit)
         return nears, fars, hits
 
+    @property
+    def have_peak(self) -> bool:
+        """Whether any of them has a truncated forward peak."""
+        return any(march.medium.phase.forward for march in self.marches)
+
+    @staticmethod
     def march(
-        self, ray: mi.Ray3f, spans: tuple[list, list, list], offset: mi.Float
+        ray: mi.Ray3f,
+        spans: tuple[list, list, list],
+        offset: mi.Float,
+        parts: list[tuple[list[CameraReplay], mi.Bool]],
     ) -> tuple[list[mi.Spectrum], list[mi.Spectrum], mi.Spectrum]:
         """Return ``scattered``, ``before`` and ``through`` of `_Segment`."""
         one = mi.Spectrum(dr.ones(mi.Float, dr.width(offset)))
         scattered, transmittances = [], []
-        for march, near, far, hit in zip(self.marches, *spans, strict=True):
-            found = march.radiance(RaySegments(ray, near, far, one, offset, hit))
-            dr.eval(found)
-            scattered.append(found[0])
-            transmittances.append(found[1])
+        for number, (near, far, hit) in enumerate(zip(*spans, strict=True)):
+            total, passed = 0 * one, mi.Spectrum(one)
+            for marches, mask in parts:
+                rays = RaySegments(ray, near, far, one, offset, hit & mask)
+                found, transmittance = marches[number].radiance(rays)
+                total, passed = total + found, passed * transmittance
+                dr.eval(total, passed)
+            scattered.append(total)
+            transmittances.append(passed)
         nears = spans[0]
         before, through = [], mi.Spectrum(one)
         for number, near in enumerate(nears):
@@ -203,7 +216,7 @@ class PathAdjoint:
     ``emitters`` and ``surfaces`` state whether derivatives with respect to the radiance of emitters
     and to BSDFs are added to the gradients of their parameters; ``hide_emitters`` is the
     integrator's property; ``events`` is the number of scattering events along a path at most, None
-    without a limit.
+    without a limit. What passes null interfaces and thin panes straight is no event.
     """
 
     def __init__(
@@ -218,7 +231,7 @@ class PathAdjoint:
         self._scene, self._media, self._hides = scene, media, hide_emitters
         self._emitters, self._surfaces, self._events = emitters, surfaces, events
         self._attenuating = None if events is None else media.without_scattering()
-        #: the media for all rays but those of the camera
+        #: the media for rays from voxels and diffuse surfaces
         self._indirect = media.without_peak()
         self._segments: list[_Segment] = []
         self._vertices: list[_Vertex | None] = []
@@ -231,9 +244,12 @@ class PathAdjoint:
         ray, weight, rng = start.ray, mi.Spectrum(start.adjoint), start.rng
         active, origin, total = mi.Bool(True), dr.zeros(mi.Interaction3f), mi.Spectrum(0)
         density, vertex = mi.Float(0), None
+        is_from_camera = start.adjoint_of_irradiance is None
         # whether the camera sees what the path hits, straight or through null interfaces
-        is_seen = mi.Bool(start.adjoint_of_irradiance is None)
-        if start.adjoint_of_irradiance is not None:
+        is_seen = mi.Bool(is_from_camera)
+        # whether it does so also by reflection and refraction; number of scattering events
+        is_followed, count = mi.Bool(is_from_camera), mi.UInt32(0)
+        if not is_from_camera:
             origin = dr.zeros(mi.Interaction3f, dr.width(ray.d))
             origin.p, density = ray.o, mi.Float(UNIFORM)
             vertex, rng = self._start_in_voxel(origin, start.adjoint_of_irradiance, rng)
@@ -241,30 +257,50 @@ class PathAdjoint:
         self._vertices.append(vertex)
         for number in range(MOST_SURFACES):
             offset = 1 - rng.next_float32()
-            arrival = origin, density, is_seen
+            arrival = origin, density, is_seen, is_followed, count
             alpha = start.alpha if number == 0 else None
-            is_last = number == self._events
-            is_camera_ray = number == 0 and start.adjoint_of_irradiance is None
-            media = self._media if is_camera_ray else self._indirect
-            media = self._attenuating if is_last else media
             of_emitters = start.adjoint_of_emitters if number == 0 else None
             weights = weight, weight if of_emitters is None else of_emitters
-            segment = self._segment(ray, weights, arrival, offset, active, alpha, media)
+            parts = self._parts(number, is_from_camera, is_followed, count)
+            segment = self._segment(ray, weights, arrival[:3], offset, active, alpha, parts)
             self._segments.append(segment)
             total += segment.gathered() + segment.emitted + segment.escaped
-            if is_last:
-                self._vertices.append(None)
-                break
             active = active & segment.end.is_valid()
-            vertex, ray, weight, (origin, density, is_seen), active, rng = self._scatter(
+            vertex, ray, weight, arrival, active, rng = self._scatter(
                 segment, number, arrival, active, rng
             )
+            origin, density, is_seen, is_followed, count = arrival
             self._vertices.append(vertex)
             total += vertex.direct
-            dr.eval(total, ray, weight, origin, density, is_seen, active, rng)
+            dr.eval(total, ray, weight, arrival, active, rng)
             if not dr.any(active):
                 break
         return total
+
+    def _parts(
+        self, number: int, is_from_camera: bool, is_followed: mi.Bool, count: mi.UInt32
+    ) -> list[tuple[list[CameraReplay], mi.Bool]]:
+        """Return the marches of a segment, each with the paths for which it is used.
+
+        Forward peaks scatter radiance of narrow sources into paths that the camera follows by
+        reflection and refraction. Media scatter into paths of less than the largest number of
+        events.
+        """
+        if self._events == 0:
+            return [(self._attenuating.marches, mi.Bool(True))]
+        scatters = mi.Bool(True) if self._events is None else count < self._events
+        if not self._media.have_peak or not is_from_camera:
+            parts = [(self._indirect.marches, scatters)]
+        elif number == 0:
+            parts = [(self._media.marches, scatters)]
+        else:
+            parts = [
+                (self._media.marches, scatters & is_followed),
+                (self._indirect.marches, scatters & ~is_followed),
+            ]
+        if self._events is not None and number > 0:
+            parts.append((self._attenuating.marches, ~scatters))
+        return parts
 
     def _start_in_voxel(
         self,
@@ -312,7 +348,7 @@ class PathAdjoint:
         offset: mi.Float,
         active: mi.Bool,
         alpha: mi.Float | None,
-        media: MarchedMedia,
+        parts: list[tuple[list[CameraReplay], mi.Bool]],
     ) -> _Segment:
         """Follow rays to the next surface.
 
@@ -323,7 +359,7 @@ class PathAdjoint:
         end, distance = next_solid(self._scene, ray, active, hides)
         spans = self._media.spans(ray, distance, active)
         dr.eval(end, distance, spans)
-        scattered, before, through = media.march(ray, spans, offset)
+        scattered, before, through = self._media.march(ray, spans, offset, parts)
         emitter = end.emitter(self._scene, active)
         record = mi.DirectionSample3f(self._scene, end, origin)
         other = self._scene.pdf_emitter_direction(origin, record, active & ~is_seen)
@@ -337,8 +373,8 @@ class PathAdjoint:
             escaped = dr.select(away, through * (alpha / dr.size_v(mi.Spectrum)), 0)
         dr.eval(emitted, emitter_weight, escaped)
         return _Segment(
-            ray, distance, offset, weight, *spans, scattered, before, through, media.marches, end,
-            emitted, emitter_weight, escaped,
+            ray, distance, offset, weight, *spans, scattered, before, through, parts, end, emitted,
+            emitter_weight, escaped,
         )  # fmt: skip
 
     def _scatter(
@@ -346,19 +382,21 @@ class PathAdjoint:
     ) -> tuple[_Vertex, mi.Ray3f, mi.Spectrum, tuple, mi.Bool, mi.PCG32]:
         """Scatter paths at the end of a segment.
 
-        ``arrival`` is the position where the path last chose a direction, its density, and whether
-        the camera sees what it hits. Returns the vertex, and ray, weight and ``arrival`` of the
-        next segment.
+        ``arrival`` is the position where the path last chose a direction, its density, whether the
+        camera sees what it hits straight, or by reflection and refraction, and the number of
+        scattering events. Returns the vertex, and ray, weight and ``arrival`` of the next segment.
         """
         si, bsdf = segment.end, segment.end.bsdf()
         arriving = segment.weight * segment.through
         context = mi.BSDFContext()
         sample = mi.Point2f(rng.next_float32(), rng.next_float32())
-        record, emitter, shadow, visible = self._emitter(si, sample, active)
+        *_, is_followed, count = arrival
+        may_scatter = active if self._events is None else active & (count < self._events)
+        record, emitter, shadow, visible = self._emitter(si, sample, may_scatter)
         towards = si.to_local(record.d)
         value, other = bsdf.eval_pdf(context, si, towards, active)
         share = power_heuristic_or_one(record, dr.select(record.delta, 0, other))
-        scale = dr.select(active, arriving * visible * share, 0)
+        scale = dr.select(may_scatter, arriving * visible * share, 0)
         choice, sample = (
             rng.next_float32(),
             mi.Point2f(rng.next_float32(), rng.next_float32()),
@@ -371,7 +409,12 @@ class PathAdjoint:
         density = dr.select(is_straight, arrival[1], density)
         origin = dr.select(is_straight, arrival[0], mi.Interaction3f(si))
         is_seen = is_straight & arrival[2]
-        active = active & (dr.max(dr.abs(weight)) > 0)
+        is_followed &= ~mi.has_flag(found.sampled_type, mi.BSDFFlags.Diffuse)
+        may_go_on = active & (is_straight | may_scatter)
+        count = dr.select(is_straight, count, count + 1)
+        # A path that ends here has no derivative with respect to what the BSDF scatters.
+        scattering = dr.select(may_go_on, factor * found.pdf, 0)
+        active = may_go_on & (dr.max(dr.abs(weight)) > 0)
         chance = mi.Float(1)
         if number >= ROULETTE_AFTER:
             # Relative to the start of the path, whose weight is a derivative.
@@ -381,13 +424,13 @@ class PathAdjoint:
         goes_on = rng.next_float32() < chance
         vertex = _Vertex(
             shadow, distance_to(record), scale * emitter * value, record, scale * value,
-            mi.Interaction3f(si), si, towards, value, active, found.wo, factor * found.pdf,
+            mi.Interaction3f(si), si, towards, value, active, found.wo, scattering,
         )  # fmt: skip
         active = active & goes_on
         weight = dr.select(active, weight / chance, 0)
         ray = mi.Ray3f(si.spawn_ray(si.to_world(found.wo)))
         dr.eval(vertex.direct, vertex.emitter_weight, vertex.shadow, vertex.scattering)
-        return vertex, ray, weight, (origin, density, is_seen), active, rng
+        return vertex, ray, weight, (origin, density, is_seen, is_followed, count), active, rng
 
     def contributions(self) -> list[tuple[mi.Vector3f, mi.Spectrum, mi.Spectrum]]:
         """Return the weighted radiance that is incident at starts in voxels: directions, and what
@@ -396,7 +439,7 @@ class PathAdjoint:
         (vertex, *vertices), (first, *segments) = self._vertices, self._segments
         rest = first.gathered() + first.escaped
         rest += sum((s.gathered() + s.emitted for s in segments), mi.Spectrum(0))
-        rest += sum((v.direct for v in vertices if v is not None), mi.Spectrum(0))
+        rest += sum((v.direct for v in vertices), mi.Spectrum(0))
         none = mi.Spectrum(0)
         return [(vertex.record.d, vertex.direct, none), (first.ray.d, first.emitted, rest)]
 
@@ -419,9 +462,8 @@ class PathAdjoint:
         rest = mi.Spectrum(0)
         for number in range(len(self._segments) - 1, -1, -1):
             segment, vertex = self._segments[number], self._vertices[number + 1]
-            if vertex is not None:
-                self._add_vertex(vertex, rest, splats)
-                rest = rest + vertex.direct
+            self._add_vertex(vertex, rest, splats)
+            rest = rest + vertex.direct
             skipped = without_first if number == 0 else None
             self._add_segment(segment, rest, splats, skipped)
             rest = rest + segment.gathered() + segment.emitted + segment.escaped
@@ -437,17 +479,18 @@ class PathAdjoint:
         skipped: int | None,
     ) -> None:
         behind = rest + segment.emitted + segment.escaped
-        for number, march in enumerate(segment.marches):
+        for number in range(len(self._media.marches)):
             if number == skipped:
                 continue
             passed = segment.weight * segment.before[number]
             near, far, hit = segment.near[number], segment.far[number], segment.hit[number]
-            rays = RaySegments(segment.ray, near, far, passed, segment.offset, hit)
             ahead = segment.behind(number) + behind
-            own = splats[number]
-            if march.irradiance is None:  # nothing is scattered, so nothing collides for the path
-                own = CameraSplats(own.sigma_t, None, None)
-            march.replay(rays, ahead, mi.Spectrum(0), own)
+            for marches, mask in segment.parts:
+                march, own = marches[number], splats[number]
+                rays = RaySegments(segment.ray, near, far, passed, segment.offset, hit & mask)
+                if march.irradiance is None:  # nothing is scattered, so that nothing collides
+                    own = CameraSplats(own.sigma_t, None, None)
+                march.replay(rays, ahead, mi.Spectrum(0), own)
         dr.eval()
         if self._emitters:
             with dr.resume_grad():
