@@ -20,14 +20,12 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.gradients.fit_ranges import Range, Ranges, check_parameter
 from mitsuba_irrcache.gradients.fit_state import (
     LOSSES,
-    Range,
-    Ranges,
     Result,
     Settings,
     View,
-    check_parameter,
     comparable_colours,
     in_colours,
 )

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.validation.gradients.cases import POINT, SKY, SUN, Case
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients.fit_state import (
+from mitsuba_irrcache.gradients.fit_ranges import (
     BACKWARDS,
     BLACKEST,
     FORWARDS,
@@ -19,9 +19,8 @@ from mitsuba_irrcache.gradients.fit_state import (
     Range,
     Ranges,
     check_parameter,
-    comparable_colours,
-    in_colours,
 )
+from mitsuba_irrcache.gradients.fit_state import comparable_colours, in_colours
 
 
 def surfaces() -> dict:
