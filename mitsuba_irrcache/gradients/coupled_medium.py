@@ -27,6 +27,7 @@ from mitsuba_irrcache.gradients.medium import (
     field_of,
     splat_of,
     sums_for,
+    warn_of_aureole,
 )
 from mitsuba_irrcache.gradients.parameters import ALBEDO, SIGMA_T
 from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, InScattering
@@ -175,6 +176,7 @@ class CoupledMedium:
         dr.eval(self.extinction)
         self.values = [self._cached(scene, channel) for channel in range(self.channels)]
         self._update()
+        warn_of_aureole(part)
 
     @property
     def basis(self) -> AngularBasis | None:

@@ -123,7 +123,7 @@ class MediumAdjoint:
             if self.transport.channels == 1:
                 factors = [dr.opaque(mi.Float, float(c)) for c in self.transport.colour]
                 colour = mi.Spectrum(factors)
-        _warn_of_aureole(part)
+        warn_of_aureole(part)
         neighbours = None
         if self.phases is not None:
             marches = [
@@ -387,7 +387,7 @@ def _largest(channels: list[mi.Float]) -> float:
     return max((float(dr.max(dr.abs(values))[0]) for values in channels), default=0.0)
 
 
-def _warn_of_aureole(part: CachedMedium) -> None:
+def warn_of_aureole(part: CachedMedium) -> None:
     """Log a warning if derivatives neglect multiple scattering into a forward peak."""
     cache = part.cache
     if part.medium.original is None or cache is None or cache.directional is None:

@@ -150,9 +150,9 @@ def refuse(key: str, reason: str) -> None:
     """Raise IrrcacheError for a parameter with respect to which no gradient is computed."""
     raise IrrcacheError(
         f'irrcache computes no gradient of the parameter "{key}": {reason}. It has gradients of '
-        "sigma_t and albedo of a medium, of g of hg, of radiance and emission, among surfaces of "
-        "diffuse reflectance and, in isotropic media without surfaces, of positions of points and "
-        "directions of suns; detach this "
+        "sigma_t and albedo of a medium, and of radiance; without surfaces of g of hg, of emission "
+        "and, in isotropic media, of positions of points and directions of suns; among surfaces of "
+        "diffuse reflectance; detach this "
         'parameter (dr.disable_grad, params.update), or use the integrator "prbvolpath".'
     )
 
