@@ -15,16 +15,17 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.border import BorderProfile
+from mitsuba_irrcache.cache.direct_light import spread
 from mitsuba_irrcache.cache.lookups import root_field
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.gradients.fluence import cached_components
 from mitsuba_irrcache.gradients.forward_peak import with_forward_peak
 from mitsuba_irrcache.gradients.medium import (
-    EMPTY,
     MARGIN,
     PAIRS,
     SHARP_PAIRS,
     field_of,
+    means_over_collisions,
     splat_of,
     sums_for,
     warn_of_aureole,
@@ -201,20 +202,18 @@ class CoupledMedium:
         for light in cache.direct_lights:
             # The cached moments exclude what camera rays evaluate in closed form.
             (own,) = sources_of(scene, [light.emitter])[1]
-            irradiance = self._spread(light.irradiance[channel])
+            active = self.cache.active
+            irradiance = spread(self.grid, active, [light.irradiance[channel]], None)
             narrow[_index(sources, own)] = irradiance
             if not own.sharp:
-                means = [self._spread(mean[channel]) for mean in light.angular_means()]
+                means = [
+                    spread(self.grid, active, [mean[channel]], None)
+                    for mean in light.angular_means()
+                ]
                 higher = zip(values[1:], means, strict=False)
                 values[1:] = [a + irradiance * mean for a, mean in higher]
         dr.eval(values, narrow)
         return values + narrow
-
-    def _spread(self, values: mi.Float) -> mi.Float:
-        """Return ``values`` of the active voxels at all voxels."""
-        found = dr.zeros(mi.Float, self.grid.voxel_count)
-        dr.scatter(found, values, self.cache.active)
-        return found
 
     @property
     def unknown(self) -> mi.UInt32:
@@ -267,18 +266,7 @@ class CoupledMedium:
 
     def mean(self, sums: VoxelSums) -> list[Components]:
         """Return the adjoint fluence of the collisions that are summed in ``sums``, by channel."""
-        # docs/primer, eq. (8.4)
-        least = dr.opaque(mi.Float, EMPTY / float(self.grid.voxel_size.min()))
-        volume, values = dr.opaque(mi.Float, 1 / volume_of(self.grid)), sums.values()
-        found = [
-            [
-                dr.select(s > least, total * volume / dr.maximum(s, least), 0)
-                for total in values[c * self.components : (c + 1) * self.components]
-            ]
-            for c, s in enumerate(self.extinction)
-        ]
-        dr.eval(found)
-        return found
+        return means_over_collisions(self.grid, sums, self.extinction, self.components)
 
     def splats(
         self, largest: float, count: float, collisions: bool, derivatives: bool

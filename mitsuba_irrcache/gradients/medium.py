@@ -24,10 +24,11 @@ from mitsuba_irrcache.gradients.placement import placement_derivative
 from mitsuba_irrcache.gradients.points import add_paths_to_light
 from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, RaySegments
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
-from mitsuba_irrcache.gradients.scattering import split
+from mitsuba_irrcache.gradients.scattering import Components, split
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives, TransportSettings
 from mitsuba_irrcache.grids.fields import Field
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -300,18 +301,9 @@ class MediumAdjoint:
 
         It is one array for each channel, whose components follow each other.
         """
-        # docs/primer, eq. (8.4)
-        least = dr.opaque(mi.Float, EMPTY / float(self.grid.voxel_size.min()))
-        per_volume = dr.opaque(mi.Float, 1 / volume_of(self.grid))
-        values, count = sums.values(), self.transport.scattering.camera_count
-        found = [
-            [
-                dr.select(mean > least, total * per_volume / dr.maximum(mean, least), 0)
-                for total in values[c * count : (c + 1) * count]
-            ]
-            for c, mean in zip(range(self.transport.channels), self.extinction, strict=False)
-        ]
-        dr.eval(found)
+        extinction = self.extinction[: self.transport.channels]
+        count = self.transport.scattering.camera_count
+        found = means_over_collisions(self.grid, sums, extinction, count)
         return [concatenated(components) for components in found]
 
     def transported(self, fluence: list[mi.Float]) -> dict[str, mi.Float]:
@@ -372,6 +364,27 @@ def splat_of(field: Field, channels: int, bound: float) -> GridSplat | ConstantS
     if field.grid is None:
         return ConstantSplat(channels, bound)
     return GridSplat(field.grid, channels, bound)
+
+
+def means_over_collisions(
+    grid: Grid, sums: VoxelSums, extinction: list[mi.Float], count: int
+) -> list[Components]:
+    """Return the adjoint fluence of the collisions in ``sums``, by channel: ``count`` components.
+
+    ``extinction`` has its means over the voxels of ``grid``, by channel.
+    """
+    # docs/primer, eq. (8.4)
+    least = dr.opaque(mi.Float, EMPTY / float(grid.voxel_size.min()))
+    per_volume, values = dr.opaque(mi.Float, 1 / volume_of(grid)), sums.values()
+    found = [
+        [
+            dr.select(mean > least, total * per_volume / dr.maximum(mean, least), 0)
+            for total in values[c * count : (c + 1) * count]
+        ]
+        for c, mean in enumerate(extinction)
+    ]
+    dr.eval(found)
+    return found
 
 
 def values_per_voxel(cache: IrradianceCache) -> int:

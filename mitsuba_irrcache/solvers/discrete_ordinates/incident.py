@@ -236,15 +236,20 @@ class DistantIllumination:
         known = radiance > 0
         scaled = np.where(known, incoming / np.where(known, radiance, 1), 0)
         scaled = np.where(known, scaled, scaled.max(axis=-1, keepdims=True))
-        return np.where(self._is_bright(directions)[..., None] & (scaled > 0), scaled, angle)
+        is_normalised = self._numbers_of_regions(directions)[..., None] > 0
+        return np.where(is_normalised & (scaled > 0), scaled, angle)
 
-    def _is_bright(self, directions: np.ndarray) -> np.ndarray:
-        """Return whether ``directions`` and their opposites (n, 2) are in bright regions."""
-        found = is_bright(self._densities(directions))
+    def _numbers_of_regions(self, directions: np.ndarray) -> np.ndarray:
+        """Return the number of the bright region of each of ``directions`` and their opposites
+        (n, 2): from 1 on those of spots, then that of all other bright directions, 0 elsewhere.
+        """
+        regions, _ = self._regions()
         towards = np.stack([-directions, directions], axis=1)
-        for region in self._regions()[0]:
-            found |= region.covers(towards)
-        return found
+        number = np.zeros(towards.shape[:2], int)
+        for k, region in enumerate(regions, 1):
+            number[(number == 0) & region.covers(towards)] = k
+        number[(number == 0) & is_bright(self._densities(directions))] = 1 + len(regions)
+        return number
 
     def _regions(self) -> tuple:
         if self._bright_regions is None:
@@ -260,14 +265,7 @@ class DistantIllumination:
         assigned to the spots, which are most likely close to it.
         """
         regions, irradiance = self._regions()
-        numbers = []
-        for directions, *_ in sets:
-            towards = np.stack([-directions, directions], axis=1)
-            number = np.zeros(towards.shape[:2], int)
-            for k, region in enumerate(regions, 1):
-                number[(number == 0) & region.covers(towards)] = k
-            number[(number == 0) & is_bright(self._densities(directions))] = 1 + len(regions)
-            numbers.append(number)
+        numbers = [self._numbers_of_regions(directions) for directions, *_ in sets]
         if not any((number == 1 + len(regions)).any() for number in numbers):
             first = 1 if regions else 0
             remaining, others = irradiance[-1], irradiance[first:-1]
