@@ -142,11 +142,11 @@ class MarchedMedia:
     def __init__(self, marches: Sequence[CameraReplay]) -> None:
         self.marches = list(marches)
 
-    def without_peak(self) -> MarchedMedia:
-        """Return the media for rays into which their forward peaks scatter no radiance of narrow
-        sources, because that counts as unscattered (`media/delta_m`).
+    def indirect(self) -> MarchedMedia:
+        """Return the media for rays from voxels and diffuse surfaces, into which forward peaks
+        scatter no radiance of narrow sources, because that counts as unscattered (`media/delta_m`).
         """
-        return MarchedMedia([march.without_peak() for march in self.marches])
+        return MarchedMedia([march.indirect() for march in self.marches])
 
     def without_scattering(self) -> MarchedMedia:
         """Return the media as they attenuate radiance, without what they scatter."""
@@ -165,9 +165,9 @@ class MarchedMedia:
         return nears, fars, hits
 
     @property
-    def have_peak(self) -> bool:
-        """Whether any of them has a truncated forward peak."""
-        return any(march.medium.phase.forward for march in self.marches)
+    def are_isotropic(self) -> bool:
+        """Whether all of them scatter isotropically."""
+        return all(march.medium.phase.is_isotropic for march in self.marches)
 
     @staticmethod
     def march(
@@ -232,7 +232,7 @@ class PathAdjoint:
         self._emitters, self._surfaces, self._events = emitters, surfaces, events
         self._attenuating = None if events is None else media.without_scattering()
         #: the media for rays from voxels and diffuse surfaces
-        self._indirect = media.without_peak()
+        self._indirect = media.indirect()
         self._segments: list[_Segment] = []
         self._vertices: list[_Vertex | None] = []
 
@@ -289,7 +289,7 @@ class PathAdjoint:
         if self._events == 0:
             return [(self._attenuating.marches, mi.Bool(True))]
         scatters = mi.Bool(True) if self._events is None else count < self._events
-        if not self._media.have_peak or not is_from_camera:
+        if self._media.are_isotropic or not is_from_camera:
             parts = [(self._indirect.marches, scatters)]
         elif number == 0:
             parts = [(self._media.marches, scatters)]

@@ -85,20 +85,20 @@ class InScattering:
     """Anisotropic scattering into camera rays.
 
     ``field`` evaluates the factor by which scattering into a direction differs from isotropic
-    scattering; ``basis`` has all narrow sources of the scene. Without ``with_peak`` a truncated
-    forward peak scatters no radiance of narrow sources.
+    scattering; ``basis`` has all narrow sources of the scene. If ``indirect``, the factor is an
+    estimate from one voxel, and a truncated forward peak scatters no radiance of narrow sources.
     """
 
-    def __init__(self, field: AngularField, basis: AngularBasis, with_peak: bool = True) -> None:
-        self._field, self._basis, self._with_peak = field, basis, with_peak
+    def __init__(self, field: AngularField, basis: AngularBasis, indirect: bool = False) -> None:
+        self._field, self._basis, self._indirect = field, basis, indirect
 
     def in_basis(self, basis: AngularBasis) -> InScattering:
         """Return the scattering by another phase function, that of ``basis``."""
-        return InScattering(self._field.in_basis(basis), self._basis, self._with_peak)
+        return InScattering(self._field.in_basis(basis), self._basis, self._indirect)
 
-    def without_peak(self) -> InScattering:
-        """Return the scattering without the forward peak."""
-        return InScattering(self._field, self._basis, with_peak=False)
+    def indirect(self) -> InScattering:
+        """Return the scattering into rays that the camera does not follow."""
+        return InScattering(self._field, self._basis, indirect=True)
 
     def view(self, direction: mi.Vector3f) -> tuple:
         """Evaluate what depends on the ``direction`` of rays only; an argument of other methods."""
@@ -108,7 +108,9 @@ class InScattering:
     def factor(self, p: mi.Point3f, view: tuple, active: mi.Bool) -> mi.Float | mi.Color3f:
         """Return the factor of the irradiance at ``p``, see `AngularField.factor`."""
         direction, basis, _ = view
-        return self._field.factor(p, direction, basis, active, self._with_peak)
+        if self._indirect:
+            return self._field.sampled_factor(p, direction, basis, active)
+        return self._field.factor(p, direction, basis, active)
 
     def importance(self, p: mi.Point3f, view: tuple, active: mi.Bool) -> list[mi.Float]:
         """Return the components of the importance of rays at ``p``.
@@ -118,7 +120,7 @@ class InScattering:
         """
         # docs/primer, eq. (8.12)
         direction, _, moments = view
-        gains = [1 + g for g in self._basis.gains(p, direction, active, self._with_peak)]
+        gains = [1 + g for g in self._basis.gains(p, direction, active, not self._indirect)]
         return [mi.Float(1), *moments, *gains]
 
 
@@ -173,12 +175,12 @@ class CameraReplay:
         march._direct_lights = []
         return march
 
-    def without_peak(self) -> CameraReplay:
-        """Return the march of rays that no truncated forward peak scatters into."""
-        if not self.medium.phase.forward:
+    def indirect(self) -> CameraReplay:
+        """Return the march of rays that the camera does not follow, see `InScattering`."""
+        if self._angular is None:
             return self
         march = copy(self)
-        march._angular = self._angular.without_peak()
+        march._angular = self._angular.indirect()
         return march
 
     def sigma_t(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
