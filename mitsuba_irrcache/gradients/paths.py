@@ -50,6 +50,8 @@ class Start:
         rng: random number generator.
         adjoint_of_emitters: derivative with respect to the radiance of emitters that the rays hit;
             None if it is ``adjoint``.
+        medium: the medium that the sensor names; rays of a camera do not pass any other medium in
+            which they start, as in the image.
     """
 
     ray: mi.Ray3f
@@ -58,6 +60,7 @@ class Start:
     adjoint_of_irradiance: Callable[[mi.Vector3f], mi.Spectrum] | None
     rng: mi.PCG32
     adjoint_of_emitters: mi.Spectrum | None = None
+    medium: mi.Medium | None = None
 
 
 @dataclass
@@ -164,6 +167,17 @@ class MarchedMedia:
             hits.append(hit)
         return nears, fars, hits
 
+    def unnamed(self, ray: mi.Ray3f, medium: mi.Medium | None) -> list[mi.Bool]:
+        """Return, for each medium but the given one, whether rays start in it."""
+        named = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
+        found = []
+        for march in self.marches:
+            # The grid may cover only a part of the medium.
+            hit, entry, leave = march.medium.boundary.intersect(ray)
+            within = hit & (entry < -1e-5 * (leave - entry)) & (leave > 0)
+            found.append(within & (march.medium.pointer != named))
+        return found
+
     @property
     def are_isotropic(self) -> bool:
         """Whether all of them scatter isotropically."""
@@ -262,7 +276,11 @@ class PathAdjoint:
             of_emitters = start.adjoint_of_emitters if number == 0 else None
             weights = weight, weight if of_emitters is None else of_emitters
             parts = self._parts(number, is_from_camera, is_followed, count)
-            segment = self._segment(ray, weights, arrival[:3], offset, active, alpha, parts)
+            skipped = []
+            if number == 0 and is_from_camera:
+                skipped = self._media.unnamed(ray, start.medium)
+            of_segment = offset, active, alpha, parts, skipped
+            segment = self._segment(ray, weights, arrival[:3], *of_segment)
             self._segments.append(segment)
             total += segment.gathered() + segment.emitted + segment.escaped
             active = active & segment.end.is_valid()
@@ -349,15 +367,22 @@ class PathAdjoint:
         active: mi.Bool,
         alpha: mi.Float | None,
         parts: list[tuple[list[CameraReplay], mi.Bool]],
+        skipped: list[mi.Bool],
     ) -> _Segment:
         """Follow rays to the next surface.
 
-        ``weights`` are those of scattered radiance and of the radiance of emitters.
+        ``weights`` are those of scattered radiance and of the radiance of emitters; ``skipped``
+        states for each medium, if there are any, which rays do not pass it.
         """
         (weight, of_emitters), (origin, density, is_seen) = weights, arrival
         hides = is_seen if self._hides else mi.Bool(False)
         end, distance = next_solid(self._scene, ray, active, hides)
-        spans = self._media.spans(ray, distance, active)
+        nears, fars, hits = self._media.spans(ray, distance, active)
+        for number, mask in enumerate(skipped):
+            hits[number] &= ~mask
+            nears[number] = dr.select(mask, dr.inf, nears[number])
+            fars[number] = dr.select(mask, dr.inf, fars[number])
+        spans = nears, fars, hits
         dr.eval(end, distance, spans)
         scattered, before, through = self._media.march(ray, spans, offset, parts)
         emitter = end.emitter(self._scene, active)

@@ -119,7 +119,8 @@ class Surroundings:
             alpha = None if sees or each.alpha is None else -each.alpha
             rng = self._random(CAMERA, number, count)
             paths = self._paths(from_camera=True)
-            paths.trace(Start(mi.Ray3f(each.ray), each.radiance, alpha, None, rng))
+            camera = mi.Ray3f(each.ray), each.radiance, alpha, None, rng
+            paths.trace(Start(*camera, medium=film.medium))
             if splats is None:
                 splats = self._splats(paths, film.samples, collisions=True)
             paths.add(splats)

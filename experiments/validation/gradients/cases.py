@@ -90,6 +90,8 @@ class Case:
     #: gradient and the differences are averaged
     samples: int = 64
     caches: int = 1
+    #: position of the camera, which looks at the centre
+    origin: tuple[float, float, float] = (1.0, 1.5, -5.0)
     #: further shapes, by their ids
     objects: Callable[[], dict] = field(default=dict)
 
@@ -123,7 +125,7 @@ class Case:
         }
         if self.emissive:
             integrator["emission"] = _volume(self.emission(), place)
-        look = mi.ScalarTransform4f().look_at([1.0, 1.5, -5.0], [0, 0, 0], [0, 1, 0])
+        look = mi.ScalarTransform4f().look_at([*self.origin], [0, 0, 0], [0, 1, 0])
         film = {
             "type": "hdrfilm",
             "width": 32,
