@@ -7,6 +7,7 @@ have those of `scattering`: moments, and the irradiance of each narrow source.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +16,7 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.border import BorderProfile
-from mitsuba_irrcache.cache.direct_light import spread
+from mitsuba_irrcache.cache.direct_light import DirectLight, spread
 from mitsuba_irrcache.cache.lookups import root_field
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.gradients.fluence import cached_components
@@ -37,7 +38,7 @@ from mitsuba_irrcache.gradients.scattering import Components, IsotropicScatterin
 from mitsuba_irrcache.gradients.splatting import VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, TransportSettings
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.narrow_sources import sources_of
+from mitsuba_irrcache.lights.narrow_sources import Source, sources_of
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 
 
@@ -113,8 +114,9 @@ class Importance:
         ]
         dr.eval(self._parts)
 
+    @cached_property
     def magnitude(self) -> mi.Float:
-        """Return a bound of the order of what radiance from any direction is worth in a voxel."""
+        """The order of what radiance from any direction is worth in each voxel."""
         norms = self._scattering.norms()
         total = sum(
             norm * dr.abs(layer)
@@ -175,7 +177,10 @@ class CoupledMedium:
         self.channels = self.transport.channels
         self.extinction = list(found)[: self.channels]
         dr.eval(self.extinction)
-        self.values = [self._cached(scene, channel) for channel in range(self.channels)]
+        # The cached moments exclude what camera rays evaluate in closed form.
+        lights = self.cache.direct_lights if self.basis is not None else ()
+        known = [(light, sources_of(scene, [light.emitter])[1][0]) for light in lights]
+        self.values = [self._cached(known, channel) for channel in range(self.channels)]
         self._update()
         warn_of_aureole(part)
 
@@ -189,8 +194,10 @@ class CoupledMedium:
         """Number of components of the adjoint fluence of rays from outside."""
         return self.transport.scattering.camera_count
 
-    def _cached(self, scene: mi.Scene, channel: int) -> Components:
-        """Return the components of the cached fluence of a channel, 0 at inactive voxels."""
+    def _cached(self, lights: list[tuple[DirectLight, Source]], channel: int) -> Components:
+        """Return the components of the fluence of a channel, 0 at inactive voxels: those of the
+        cache, and those of the ``lights`` that it lacks.
+        """
         cache, known = self.cache, cached_components(self.cache, channel)
         if self.basis is None:
             return known
@@ -199,10 +206,8 @@ class CoupledMedium:
         narrow = [dr.zeros(mi.Float, self.grid.voxel_count) for _ in sources]
         for own, irradiance in zip(cache.directional.sources, known[count:], strict=True):
             narrow[_index(sources, own)] = irradiance
-        for light in cache.direct_lights:
-            # The cached moments exclude what camera rays evaluate in closed form.
-            (own,) = sources_of(scene, [light.emitter])[1]
-            active = self.cache.active
+        active = cache.active
+        for light, own in lights:
             irradiance = spread(self.grid, active, [light.irradiance[channel]], None)
             narrow[_index(sources, own)] = irradiance
             if not own.sharp:
@@ -301,6 +306,6 @@ class CoupledMedium:
         return with_forward_peak(self.medium, found, self._summed[SIGMA_T], self.wanted)
 
 
-def _index(sources: list, source: object) -> int:
+def _index(sources: list[Source], source: Source) -> int:
     """Return the index of the same source among ``sources``."""
     return next(i for i, other in enumerate(sources) if other.is_same(source))

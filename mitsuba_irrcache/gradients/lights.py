@@ -69,18 +69,19 @@ class LightsOfOneDirection:
 
     def towards(self, light: int) -> mi.Vector3f:
         """Return the direction from each voxel to an emitter, given its index."""
-        at = dr.zeros(mi.Interaction3f, dr.width(self.positions))
-        at.p = self.positions
-        return self.emitters[light].sample_direction(at, mi.Point2f(0.5))[0].d
+        return self._record(light).d
 
     def transmittance(self, light: int) -> mi.Spectrum:
         """Return the transmittance of the medium between each voxel and a point or spot."""
-        at = dr.zeros(mi.Interaction3f, dr.width(self.positions))
-        at.p = self.positions
-        record, _ = self.emitters[light].sample_direction(at, mi.Point2f(0.5))
+        record = self._record(light)
         ray = mi.Ray3f(self.positions, record.d)
         through = medium_transmittance(self._medium, ray, record.dist, mi.Bool(True))
         return mi.Spectrum(through)
+
+    def _record(self, light: int) -> mi.DirectionSample3f:
+        at = dr.zeros(mi.Interaction3f, dr.width(self.positions))
+        at.p = self.positions
+        return self.emitters[light].sample_direction(at, mi.Point2f(0.5))[0]
 
     def derivative(self, light: int, direct: list[list[Components]]) -> mi.Spectrum:
         """Return the derivatives with respect to the irradiance of an emitter, by voxel.

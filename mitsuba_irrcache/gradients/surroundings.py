@@ -213,7 +213,7 @@ class Surroundings:
         """Return paths from voxels of a medium, sampled in proportion to what radiance is worth
         there; None if it is worth nothing.
         """
-        grid, magnitude = self.media[number].grid, importance.magnitude()
+        grid, magnitude = self.media[number].grid, importance.magnitude
         total = float(dr.sum(magnitude)[0])
         if not 0 < total < np.inf:
             return None
@@ -246,6 +246,6 @@ class Surroundings:
 
 def _norm(importances: list[Importance]) -> float:
     """Return the sum of the magnitudes of what radiance is worth in all voxels."""
-    sums = [dr.sum(importance.magnitude()) for importance in importances]
+    sums = [dr.sum(importance.magnitude) for importance in importances]
     dr.eval(sums)
     return sum(float(each[0]) for each in sums)
