@@ -32,6 +32,7 @@ from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.camera import CameraRays, TracedCameraRays
 from mitsuba_irrcache.render.certificate import Certificate
 from mitsuba_irrcache.render.film import check_film, exclusive
+from mitsuba_irrcache.scene.clearance import SeparatedScene
 
 if TYPE_CHECKING:  # most programs compute no gradients: their modules are imported on use
     from mitsuba_irrcache.gradients.backward import ParameterAdjoint
@@ -279,6 +280,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         )
         self._source = CameraRaySource(self._options, self._stopping, self._stock, self._faster)
         self._builder = self._source.builder
+        self._separation = SeparatedScene()
         self._image = ImageRenderer(self._options)
         # Held by the images that share it: they hold the integrator.
         self._shared: ref[SharedIrradiance] | None = None
@@ -347,6 +349,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         With a ``tolerance``, it is the cache for an image of ``sensor``. If several threads call
         this, one builds the cache and the others wait.
         """
+        scene = self._separated(scene)
         if self._source.depends_on_view:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with dr.suspend_grad(), self._builder.lock:
@@ -368,8 +371,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._source.refuse_tolerance("it chooses the cache for one view, and here there is none")
         self._source.refuse_mapped("a cache in memory")
         with self._builder.lock, dr.suspend_grad():
-            self._builder.fit(scene)
+            self._builder.fit(self._separated(scene))
             return list(self._builder.parts)
+
+    def _separated(self, scene: mi.Scene) -> mi.Scene:
+        """Return the scene to trace, in which no surface lies in the boundary of a medium."""
+        with self._builder.lock:
+            return self._separation.of(scene)
 
     def _prepared(self, scene: mi.Scene) -> CameraRays | None:
         """Return the camera rays for the cache of ``scene``; None if no medium is visible."""
@@ -404,6 +412,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """
         self._source.refuse_tolerance("another integrator calls this one, without the sensor")
         self._source.refuse_mapped("an integrator that calls this one")
+        scene = self._separated(scene)
         camera_rays = self._prepared(scene)
         if camera_rays is None:
             radiance, valid, _ = self._stock.chosen.sample(scene, sampler, ray, medium, active)
@@ -428,6 +437,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         # Threads exclude each other if they share the integrator, whose cache one of them may
         # refine, or the film, which stores one image only.
         with dr.suspend_grad(), self._builder.lock, exclusive(sensor.film()):
+            scene = self._separated(scene)
             if self._source.depends_on_view:
                 spp = self._source.meet_tolerance(scene, sensor, spp, seed, self.progress)
             film = self._rendered(scene, sensor, seed, spp)
@@ -460,7 +470,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         faster for a single image.
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        return self._source.cheaper_stock_image(scene, sensor, spp) is None
+        return self._source.cheaper_stock_image(self._separated(scene), sensor, spp) is None
 
     def progressive(
         self,
@@ -485,7 +495,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         self._stopping.begin()
         progress = self._stopping.raising(self.progress)
-        return frames(self._builder, scene, image, Targets(**targets), progress)
+        traced = self._separated(scene)
+        return frames(self._builder, traced, image, Targets(**targets), progress)
 
     def render_forward(
         self,
@@ -558,7 +569,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     def revision(self, scene: mi.Scene) -> int:
         """Bring the cache up to date, and return the number of its state."""
         with self._builder.lock:
-            self._prepared(scene)
+            self._prepared(self._separated(scene))
             return self._builder.revision
 
     def adjoint(
@@ -570,6 +581,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         self._source.refuse_tolerance("an objective would jump with the resolution")
         self._source.refuse_mapped("a gradient")
+        scene = self._separated(scene)
         camera_rays = self._prepared(scene)
         parts, rays = self._builder.parts, self._options.rays
         check(parts, keys, rays.layered)

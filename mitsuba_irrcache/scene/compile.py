@@ -7,7 +7,6 @@ other scenes Mitsuba's ray tracing finds surfaces and boundaries.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -35,15 +34,14 @@ from mitsuba_irrcache.media.delta_m import without_forward_peak
 from mitsuba_irrcache.media.emission import Emission, check_emission_is_within
 from mitsuba_irrcache.media.medium import MediumContext, MediumGrid
 from mitsuba_irrcache.media.phase import Phase, refuse_sharp
+from mitsuba_irrcache.scene.clearance import points_on, ray_offset, touched_faces
 from mitsuba_irrcache.scene.consistency import (
-    RAY_OFFSET,
     check_media_agree,
     check_sensor,
     described,
     warn_of_missing_medium,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
-from mitsuba_irrcache.scene.occluders import corners_of
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     Media,
@@ -57,17 +55,12 @@ from mitsuba_irrcache.transport.path import (
 #: Offset of Mitsuba's secondary rays from a surface, over the shortest side of a medium, above
 #: which a warning is logged.
 LARGEST_OFFSET = 0.002
-#: Number of points on a surface, their largest distance from a face of the boundary of a medium
-#: over the edge of the box, and their smallest share, for which both are said to coincide.
-COINCIDENCE_POINTS, COINCIDENT, COINCIDENT_SHARE = 256, 1e-5, 0.1
 #: Relative difference of the cosines of face normals and interpolated normals of an emissive mesh,
 #: averaged over its area, above which a warning is logged.
 MOST_LOST = 0.02
 #: Number of samples by which the radiance behind media is bounded, and kinds of emitters that are
 #: seen by reflection only.
 BOUND_SAMPLES, REFLECTED = 4096, (EmitterKind.SUN, *POINT_LIKE)
-#: Shapes with flat parts, besides meshes; others, such as instances, need not sample positions.
-FLAT = ("Rectangle", "Disk")
 #: Minimum number of distinct single-precision coordinates within a side of a medium, and within a
 #: voxel.
 STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
@@ -448,7 +441,7 @@ def _warn_of_scale(grids: Sequence[MediumGrid]) -> None:
     to their distance from the origin, is large compared to the medium.
     """
     for grid in grids:
-        offset = _ray_offset(grid)
+        offset = ray_offset(grid.frame)
         size = np.linalg.norm(grid.frame[:3, :3], axis=0).min()
         if offset > LARGEST_OFFSET * size:
             mi.Log(
@@ -459,29 +452,22 @@ def _warn_of_scale(grids: Sequence[MediumGrid]) -> None:
             )
 
 
-def _ray_offset(grid: MediumGrid) -> float:
-    """Return by how much Mitsuba offsets rays from the boundary of a medium."""
-    return float((1 + np.abs(corners_of(grid.frame)).max()) * RAY_OFFSET)
-
-
 def _warn_of_coincidence(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
     """Log a warning if a surface lies in a face of the box that bounds a medium, or so close to it
     that rays which cross the boundary skip it, because Mitsuba offsets them.
     """
-    rng = np.random.default_rng(COINCIDENCE_POINTS)
-    sample = mi.Point2f(np.float32(rng.random((2, COINCIDENCE_POINTS))))
-    for shape in filter(is_surface, scene.shapes()):
-        may_be_flat = shape.is_mesh() or shape.class_name() in FLAT
-        if not may_be_flat or shape.interior_medium() or shape.exterior_medium():
+    for shape in scene.shapes():
+        p = points_on(shape)
+        if p is None:
             continue
-        p = np.array(shape.sample_position(0.0, sample).p, dtype=np.float64)
         for grid in grids:
             is_box = grid.boundary.kind == "box" and grid.has_exact_boundary
-            if is_box and _lie_in_a_face(p, grid.frame, _ray_offset(grid)):
+            offset = ray_offset(grid.frame)
+            if is_box and touched_faces(p, grid.frame):
                 mi.Log(
                     mi.LogLevel.Warn,
                     f"irrcache: {described(shape)} lies in a face of the boundary of medium "
-                    f'"{grid.name}", or within {_ray_offset(grid):.2g} of it, so that rays which '
+                    f'"{grid.name}", or within {offset:.2g} of it, so that rays which '
                     "cross the boundary pass the surface, also in volpath: the image is wrong "
                     "around it. Extend the boundary beyond the surface, or leave a gap of a "
                     "thousandth of its size.",
@@ -526,24 +512,6 @@ def _warn_of_normals(emitter: mi.Emitter) -> None:
             "its emission by the former, which rays that hit it do not: volpath is inconsistent, "
             'and solver "sweep" uses the latter. Set face_normals to true.',
         )
-
-
-def _lie_in_a_face(p: np.ndarray, frame: np.ndarray, distance: float) -> bool:
-    """Return whether a share of the points ``p`` (3, n) of a surface lies in the plane of a face of
-    the unit cube mapped by ``frame``, or within a ``distance`` of it, and their bounds overlap the
-    face.
-    """
-    inverse = np.linalg.inv(frame)
-    u = inverse[:3, :3] @ p + inverse[:3, 3:]
-    for axis, face in itertools.product(range(3), (0, 1)):
-        edges = max(COINCIDENT, distance * np.linalg.norm(inverse[axis, :3]))
-        own = np.abs(u[axis] - face) < edges
-        if own.mean() < COINCIDENT_SHARE:
-            continue
-        across = np.delete(u[:, own], axis, axis=0)
-        if (across.max(axis=1) > 0).all() and (across.min(axis=1) < 1).all():
-            return True
-    return False
 
 
 def _brightest(scene: mi.Scene) -> float:

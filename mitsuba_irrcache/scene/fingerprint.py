@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -56,12 +57,13 @@ class SceneVersion:
         scene: mi.Scene,
         emission: mi.Volume | None = None,
         previous: SceneVersion | None = None,
+        selected: Callable[[str, mi.Object], bool] = lambda name, node: True,
     ) -> None:
         """Record the present version of ``scene``.
 
         ``emission`` is a volume of the integrator, which need not be part of the scene. Values that
         have not changed since the ``previous`` version are shared with it, so that comparing the
-        two is fast.
+        two is fast. Parameters that are not ``selected``, by name and object, are left out.
         """
         params = mi.traverse(scene)
         camera_side = (mi.Sensor, mi.Film, mi.Sampler, mi.Integrator, mi.ReconstructionFilter)
@@ -75,7 +77,7 @@ class SceneVersion:
         if emission is not None:
             own = mi.traverse(emission).properties
             entries |= {f"emission.{key}": entry for key, entry in own.items()}
-        values = {key: _value(entry) for key, entry in entries.items()}
+        values = {key: _value(e) for key, e in entries.items() if selected(key, e[2])}
         #: whether a parameter carries gradients
         self.carries_gradients = any(map(graph_variables, values.values()))
         shared = {} if previous is None else previous._values
