@@ -218,7 +218,7 @@ def _check_normals(scene: mi.Scene, shape: mi.Shape, name: str) -> None:
     Mitsuba's ray offset steps over its boundary.
     """
     inwards, _ = orientation(scene, shape)
-    mixed = shape.is_mesh() and not _is_consistent(_orientations(shape))
+    mixed = shape.is_mesh() and not _is_consistently_wound(shape)
     if inwards > 0.5 or (mixed and inwards > MAX_INWARD_SHARE):
         some = "the normals" if inwards > 1 - MAX_INWARD_SHARE else f"{inwards:.0%} of the normals"
         raise UnsupportedSceneError(
@@ -227,23 +227,13 @@ def _check_normals(scene: mi.Scene, shape: mi.Shape, name: str) -> None:
         )
 
 
-def points_outwards(mesh: mi.Mesh) -> bool:
-    """Return whether all triangles of a convex mesh face away from its centre."""
-    return bool((_orientations(mesh) >= 0).all())
-
-
-def _orientations(mesh: mi.Mesh) -> np.ndarray:
-    """Return a number for each triangle of a convex mesh, positive if it faces away from the
-    centre.
-    """
+def _is_consistently_wound(mesh: mi.Mesh) -> bool:
+    """Return whether all triangles of a convex mesh have the same side towards its centre."""
     values = mi.traverse(mesh)
     vertices = np.array(values["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     a, b, c = vertices[np.array(values["faces"]).reshape(-1, 3).T]
-    return np.einsum("ij,ij->i", a - vertices.mean(axis=0), np.cross(b - a, c - a))
-
-
-def _is_consistent(orientations: np.ndarray) -> bool:
-    return bool((orientations >= 0).all() or (orientations <= 0).all())
+    volume = np.einsum("ij,ij->i", a - vertices.mean(axis=0), np.cross(b - a, c - a))
+    return bool((volume >= 0).all() or (volume <= 0).all())
 
 
 def box_frame(vertices: np.ndarray) -> np.ndarray | None:

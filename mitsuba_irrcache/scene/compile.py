@@ -34,14 +34,15 @@ from mitsuba_irrcache.media.delta_m import without_forward_peak
 from mitsuba_irrcache.media.emission import Emission, check_emission_is_within
 from mitsuba_irrcache.media.medium import MediumContext, MediumGrid
 from mitsuba_irrcache.media.phase import Phase, refuse_sharp
-from mitsuba_irrcache.scene.clearance import points_on, ray_offset, touched_faces
 from mitsuba_irrcache.scene.consistency import (
+    RAY_OFFSET,
     check_media_agree,
     check_sensor,
     described,
     warn_of_missing_medium,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.scene.occluders import corners_of
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     Media,
@@ -119,7 +120,6 @@ def compile_scene(
         if not visible:
             _warn_that_none_is_visible(emission, reason)
         _warn_of_scale(grids)
-        _warn_of_coincidence(scene, grids)
     for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
@@ -441,7 +441,7 @@ def _warn_of_scale(grids: Sequence[MediumGrid]) -> None:
     to their distance from the origin, is large compared to the medium.
     """
     for grid in grids:
-        offset = ray_offset(grid.frame)
+        offset = float((1 + np.abs(corners_of(grid.frame)).max()) * RAY_OFFSET)
         size = np.linalg.norm(grid.frame[:3, :3], axis=0).min()
         if offset > LARGEST_OFFSET * size:
             mi.Log(
@@ -450,28 +450,6 @@ def _warn_of_scale(grids: Sequence[MediumGrid]) -> None:
                 f"near it skip up to {offset:.1g}, as in volpath: the image is too dark. "
                 "Scale the scene up, or move it to the origin.",
             )
-
-
-def _warn_of_coincidence(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
-    """Log a warning if a surface lies in a face of the box that bounds a medium, or so close to it
-    that rays which cross the boundary skip it, because Mitsuba offsets them.
-    """
-    for shape in scene.shapes():
-        p = points_on(shape)
-        if p is None:
-            continue
-        for grid in grids:
-            is_box = grid.boundary.kind == "box" and grid.has_exact_boundary
-            offset = ray_offset(grid.frame)
-            if is_box and touched_faces(p, grid.frame):
-                mi.Log(
-                    mi.LogLevel.Warn,
-                    f"irrcache: {described(shape)} lies in a face of the boundary of medium "
-                    f'"{grid.name}", or within {offset:.2g} of it, so that rays which '
-                    "cross the boundary pass the surface, also in volpath: the image is wrong "
-                    "around it. Extend the boundary beyond the surface, or leave a gap of a "
-                    "thousandth of its size.",
-                )
 
 
 def _warn_of_weight(emitter: mi.Emitter) -> None:

@@ -88,23 +88,6 @@ def test_nothing_can_be_changed(scenes):
     assert denser.macrocells is not medium.macrocells
 
 
-@pytest.mark.parametrize(
-    ("height", "expected"), [(-1.0, True), (-1.0001, True), (-1.01, False), (-0.5, False)]
-)
-def test_surfaces_in_a_face_of_the_boundary_are_named(scenes, logged, height, expected):
-    """A floor in the plane of a face, one that offset rays skip (the image is 9 % too dark, blocks
-    have an error of their whole value), and a cube that has a face there but lies elsewhere.
-    """
-    place = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], -90).scale(4)
-    floor = {"type": "rectangle", "id": "floor", "to_world": place}
-    beside = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([3, 0, 0])}
-    shape = scenes.boundary(scenes.medium(1.0, 0.5))
-    compile_scene(scenes.load({"type": "volpath"}, shape, floor=floor, beside=beside))
-    found = [text for text in logged if "lies in a face" in text]
-    assert len(found) == expected
-    assert all('"floor"' in text for text in found)
-
-
 @pytest.mark.parametrize(("weight", "expected"), [(0.0, 1), (2.0, 0)])
 def test_emitters_that_are_never_sampled_are_noted(scenes, logged, weight, expected):
     lamp = {"type": "point", "position": [2, 0, 0], "sampling_weight": weight}
