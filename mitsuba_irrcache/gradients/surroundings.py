@@ -26,10 +26,13 @@ from mitsuba_irrcache.gradients.paths import MarchedMedia, PathAdjoint, Start
 from mitsuba_irrcache.gradients.replay import CameraSplats
 from mitsuba_irrcache.gradients.scattering import Components
 
-#: Maximum number of paths of a launch; number of paths from voxels for derivatives through the
-#: irradiance from the surroundings; number for each exchange with the surroundings; number of
-#: directions by which the fluence of voxels without a cached value is estimated.
+#: Maximum number of paths of a launch; maximum number of paths from voxels for derivatives through
+#: the irradiance from the surroundings; maximum number for each exchange with the surroundings;
+#: number of directions by which the fluence of voxels without a cached value is estimated.
 LANES, RAYS, EXCHANGED, DIRECTIONS = 1 << 17, 1 << 20, 1 << 18, 64
+#: Number of paths from voxels for each camera sample, so that they add a tenth to its noise, at
+#: least `FEWEST` in all, half as many for an exchange.
+PATHS_PER_SAMPLE, FEWEST = 2, 1 << 16
 #: Largest change of the adjoint fluence by a further exchange, relative to the whole; and number of
 #: exchanges, at most.
 TOLERANCE, MOST_EXCHANGES = 3e-3, 32
@@ -59,6 +62,7 @@ class Surroundings:
     ) -> None:
         self._scene, self.media, self._hides = scene, media, hide_emitters
         self._kinds, self._seed = kinds, seed
+        self._samples = 0  # camera samples of the views so far
         for number, medium in enumerate(media):
             self._complete(number, medium)
 
@@ -112,6 +116,7 @@ class Surroundings:
         """Return the sums of derivatives at a fixed fluence, and the components of the adjoint
         fluence of camera rays for each medium and channel.
         """
+        self._samples += film.samples
         splats = None
         sees = self._scene.environment() is not None and not self._hides
         for number, each in enumerate(film.passes()):
@@ -144,14 +149,14 @@ class Surroundings:
         # docs/primer, eq. (8.19)
         splats = None
         for number, importance in enumerate(self._importances(self._solved(camera))):
-            for first, rays in self._launches(RAYS, len(self.media)):
+            for first, rays in self._launches(DERIVATIVES):
                 start = self._from_voxels(number, importance, DERIVATIVES, first, rays)
                 if start is None:
                     continue
                 paths = self._paths()
                 paths.trace(start)
                 if splats is None:
-                    splats = self._splats(paths, RAYS)
+                    splats = self._splats(paths, self._count(DERIVATIVES))
                 paths.add(splats)
                 dr.eval()
         return splats or [m.splats(1e-30, 1, False, True) for m in self.media]
@@ -159,8 +164,22 @@ class Surroundings:
     def _importances(self, adjoint: list[AdjointFluence]) -> list[Importance]:
         return [m.importance(own) for m, own in zip(self.media, adjoint, strict=True)]
 
-    def _launches(self, rays: int, parts: int) -> list[tuple[int, int]]:
-        total = max(rays // parts, 1)
+    def _count(self, use: int) -> int:
+        """Return the number of paths from the voxels of all media for a ``use``.
+
+        It is a power of two: kernels, which depend on it, are reused.
+        """
+        count = max(PATHS_PER_SAMPLE * self._samples, FEWEST)
+        count = min(1 << int(np.ceil(np.log2(count))), RAYS)
+        return count if use == DERIVATIVES else min(count // 2, EXCHANGED)
+
+    def _total(self, use: int) -> int:
+        """Return the number of paths from the voxels of each medium."""
+        return max(self._count(use) // len(self.media), 1)
+
+    def _launches(self, use: int) -> list[tuple[int, int]]:
+        """Return the first path and the number of paths of each launch for a medium."""
+        total = self._total(use)
         return [(first, min(LANES, total - first)) for first in range(0, total, LANES)]
 
     def _solved(self, camera: list[list[Components]]) -> list[AdjointFluence]:
@@ -193,7 +212,7 @@ class Surroundings:
         """
         splats = None
         for number, importance in enumerate(importances):
-            for first, rays in self._launches(EXCHANGED, len(self.media)):
+            for first, rays in self._launches(EXCHANGE):
                 use = EXCHANGE | exchange << 4
                 start = self._from_voxels(number, importance, use, first, rays)
                 if start is None:
@@ -201,7 +220,7 @@ class Surroundings:
                 paths = self._paths(derivatives=False)
                 paths.trace(start)
                 if splats is None:
-                    splats = self._splats(paths, EXCHANGED, True, False)
+                    splats = self._splats(paths, self._count(EXCHANGE), True, False)
                 paths.add(splats, without_first=number)
         if splats is None:
             splats = [m.splats(1e-30, 1, True, False) for m in self.media]
@@ -218,7 +237,7 @@ class Surroundings:
         if not 0 < total < np.inf:
             return None
         rng = self._random(use, (first // LANES << 4) + number, rays)
-        count = self._total(use, len(self.media))
+        count = self._total(use)
         place = dr.arange(mi.UInt32, rays) + first
         u = (mi.Float(place) + rng.next_float32()) / count
         voxel, chance = mi.DiscreteDistribution(magnitude).sample_pmf(dr.minimum(u, 0.9999999))
@@ -239,9 +258,6 @@ class Surroundings:
         emitted = of_emitters(direction) * solid_angle
         dr.eval(scattered, emitted)
         return Start(ray, scattered, None, of_emitters, rng, emitted)
-
-    def _total(self, use: int, parts: int) -> int:
-        return max((RAYS if use == DERIVATIVES else EXCHANGED) // parts, 1)
 
 
 def _norm(importances: list[Importance]) -> float:

@@ -41,6 +41,32 @@ def fewer_paths(monkeypatch):
     monkeypatch.setattr(surroundings, "EXCHANGED", 1 << 16)
 
 
+@pytest.mark.parametrize(
+    ("spp", "views", "expected"), [(4, 1, 1 << 16), (64, 1, 1 << 17), (64, 2, 1 << 18)]
+)
+def test_paths_from_voxels_are_as_many_as_camera_samples_need(
+    mono, monkeypatch, spp, views, expected
+):
+    """They cost most of a gradient, and the noise of the camera samples exceeds theirs."""
+    scene = SURROUNDED["ground, sky"].load()
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("albedo.data"))
+    params.keep([key])
+    dr.enable_grad(params[key])
+    params.update()
+    counts = []
+    start = surroundings.Surroundings._from_voxels
+
+    def counted(self, number, importance, use, first, rays):
+        counts.append((use == surroundings.DERIVATIVES) * rays)
+        return start(self, number, importance, use, first, rays)
+
+    monkeypatch.setattr(surroundings.Surroundings, "_from_voxels", counted)
+    image = sum(mi.render(scene, params, spp=spp, seed=seed) for seed in range(views))
+    dr.backward(dr.mean(image))
+    assert sum(counts) == expected
+
+
 # Other quick tests cover the slow cases: the test in colour has a floor and a sun, that of panes a
 # window, and `test_a_distant_object_changes_nothing` a distant object.
 @pytest.mark.parametrize(
