@@ -8,14 +8,12 @@ replaced by one that has the same objects, but whose box ends a few offsets befo
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from threading import RLock
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.grids.boundary import box_frame
 from mitsuba_irrcache.scene.consistency import RAY_OFFSET, described
 from mitsuba_irrcache.scene.fingerprint import SceneVersion
 from mitsuba_irrcache.transport.path import is_surface
@@ -31,6 +29,10 @@ TILT_DEPTH, PARALLEL = 0.005, 0.999
 CLEARANCE = 3.5
 #: Largest distance by which a face is moved, over the shortest side of the boundary.
 LARGEST_CLEARANCE = 0.05
+#: Weight of the condition that vertices stay in the planes of faces that do not touch surfaces.
+OTHER_FACES = 1e-3
+#: Excludes other threads while objects, which scenes share, have other names and bounds.
+_NAMING = RLock()
 
 
 class SeparatedScene:
@@ -65,28 +67,29 @@ def separated(scene: mi.Scene) -> mi.Scene | None:
     touch them; None if no surface does.
     """
     shapes = scene.shapes()
+    boundaries = [*filter(_bounds_medium, shapes)]
+    if not boundaries:
+        return None
     # Groups of shapes, of which there may be instances, are not among the shapes of a scene.
     groups = [n for n in mi.traverse(scene).hierarchy if n.class_name() == "ShapeGroupPlugin"]
     surfaces = _scene_of([*groups, *filter(is_surface, shapes), *scene.sensors()])
     smaller = {}
-    boundaries = [*filter(_bounds_medium, shapes)]
-    if not boundaries:
-        return None
-    # The same offset for all, so that nested boundaries remain nested.
-    offset = max(map(_ray_offset, boundaries))
     for shape in boundaries:
-        made, is_touched = _smaller(shape, surfaces, offset)
-        if made is not None:
-            smaller[shape] = made
-        elif is_touched:
-            _warn(shape)
+        boundary = _Boundary(shape, _clearance(shape, boundaries), surfaces)
+        if boundary.is_touched:
+            made = boundary.smaller()
+            if made is None:
+                _warn(shape)
+            else:
+                smaller[shape] = made
     if not smaller:
         return None
     emitters = [e for e in scene.emitters() if e.get_shape() is None]
     replaced = [smaller.get(shape, shape) for shape in shapes]
-    result = _scene_of([*groups, *replaced, *emitters, *scene.sensors()])
-    for emitter in emitters:
-        emitter.set_scene(scene)  # the bounds of an environment remain those of its own scene
+    with _NAMING:
+        result = _scene_of([*groups, *replaced, *emitters, *scene.sensors()])
+        for emitter in emitters:
+            emitter.set_scene(scene)  # the bounds of an environment remain those of its own scene
     names = ", ".join(map(described, smaller))
     mi.Log(
         mi.LogLevel.Info,
@@ -98,11 +101,12 @@ def separated(scene: mi.Scene) -> mi.Scene | None:
 
 def _scene_of(objects: list[mi.Object]) -> mi.Scene:
     """Return a scene of existing objects."""
-    names = [obj.id() for obj in objects]
-    numbered = {f"object{number}": obj for number, obj in enumerate(objects)}
-    scene = mi.load_dict({"type": "scene", **numbered}, optimize=False)
-    for obj, name in zip(objects, names, strict=True):
-        obj.set_id(name)  # Mitsuba has replaced it by the key
+    with _NAMING:
+        names = [obj.id() for obj in objects]
+        numbered = {f"object{number}": obj for number, obj in enumerate(objects)}
+        scene = mi.load_dict({"type": "scene", **numbered}, optimize=False)
+        for obj, name in zip(objects, names, strict=True):
+            obj.set_id(name)  # Mitsuba has replaced it by the key
     return scene
 
 
@@ -120,64 +124,117 @@ def _matters(name: str, node: mi.Object) -> bool:
     return isinstance(node, mi.Shape) or name.endswith("sampling_weight")
 
 
-@dataclass
-class _Contact:
-    """Positions ``p`` (n, 3) on the boundary of a medium with outward normals ``n`` (n, 3), where
-    surfaces are at a ``depth`` (n) within it (negative: outside), and at most by the offset of rays
-    away where they are ``near`` (n).
-    """
-
-    p: np.ndarray
-    n: np.ndarray
-    depth: np.ndarray
-    near: np.ndarray
-
-    def planes(self, offset: float) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
-        """Yield a position, the normal, and the largest depth of surfaces for each plane of the
-        boundary in which surfaces lie.
-        """
-        left = self.near.copy()
-        while left.any():
-            p, n = self.p[left][0], self.n[left][0]
-            own = (self.n @ n > PARALLEL) & (np.abs((self.p - p) @ n) < offset)
-            if np.count_nonzero(own & self.near) >= FEWEST:
-                yield p, n, self.depth[own].max()
-            left &= ~own
-
-
 def _ray_offset(shape: mi.Shape) -> float:
     """Return by how much Mitsuba offsets rays from a shape."""
     box = shape.bbox()
     return float((1 + np.abs([box.min, box.max]).max()) * RAY_OFFSET)
 
 
-def _smaller(shape: mi.Shape, surfaces: mi.Scene, offset: float) -> tuple[mi.Mesh | None, bool]:
-    """Return a mesh like ``shape`` that ends before all surfaces that lie in its faces, and whether
-    any do.
+def _clearance(shape: mi.Shape, boundaries: list[mi.Shape]) -> float:
+    """Return the distance from surfaces at which a boundary is to end.
 
-    It is None if none do, or if it would be much smaller.
+    A boundary within another one keeps a distance from that, too.
     """
-    values = mi.traverse(shape)
-    vertices = np.array(values["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-    size = np.ptp(vertices, axis=0).min()
-    # A boundary within another one also keeps a distance from that.
-    clearance = CLEARANCE * offset * (1 if shape.exterior_medium() is None else 2)
-    frame, moved = box_frame(vertices), vertices.copy()
-    contact = _contact(shape, surfaces, max(TILT_DEPTH * size, clearance), offset)
-    touched = False
-    for p, n, depth in contact.planes(offset):
-        touched = True
-        distance = max(depth, 0.0) + clearance
-        if distance > LARGEST_CLEARANCE * size:
-            return None, True
-        # The sides of a box keep their directions.
-        edges = (
-            n[:, None] if frame is None else frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0)
-        )
-        edge = edges[:, np.abs(n @ edges).argmax()]
-        own = np.abs((vertices - p) @ n) < offset
-        moved[own] -= distance / (n @ edge) * edge
-    return (_mesh_like(shape, moved) if touched else None), touched
+    around = [b for b in boundaries if b.interior_medium() == shape.exterior_medium()]
+    others = [b for b in boundaries if b != shape]
+    outer = max((_clearance(b, others) for b in around if b in others), default=0.0)
+    return CLEARANCE * _ray_offset(shape) + outer
+
+
+class _Boundary:
+    """The mesh that bounds a medium, and the faces in which ``surfaces`` lie.
+
+    Where they do, it is to end at a distance of ``clearance`` from them.
+    """
+
+    def __init__(self, shape: mi.Shape, clearance: float, surfaces: mi.Scene) -> None:
+        self._shape, self._clearance, self._surfaces = shape, clearance, surfaces
+        self._offset = _ray_offset(shape)
+        values = mi.traverse(shape)
+        self._vertices = np.array(values["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+        self._faces = np.array(values["faces"]).reshape(-1, 3)
+        a, b, c = self._vertices[self._faces.T]
+        across = np.cross(b - a, c - a)
+        self._areas = np.linalg.norm(across, axis=1)
+        self._normals = across / np.maximum(self._areas, 1e-300)[:, None]
+        if shape.has_flipped_normals():
+            self._normals = -self._normals
+        self._size = np.ptp(self._vertices, axis=0).min()
+        #: for each triangle, the distance by which it has to move inwards
+        self._distances = self._touched()
+
+    @property
+    def is_touched(self) -> bool:
+        """Whether surfaces lie in a face."""
+        return bool((self._distances > 0).any())
+
+    def smaller(self) -> mi.Mesh | None:
+        """Return a mesh that ends before the surfaces; None if it would be much smaller, or if
+        moving its vertices does not suffice.
+        """
+        moved = self._vertices + self._moves()
+        if np.abs(moved - self._vertices).max() > LARGEST_CLEARANCE * self._size:
+            return None
+        mesh = _mesh_like(self._shape, moved)
+        if _Boundary(mesh, self._clearance, self._surfaces).is_touched:
+            return None
+        return mesh
+
+    def _moves(self) -> np.ndarray:
+        """Return the displacements (n, 3) of the vertices that move each triangle by its distance
+        in the direction of its normal, by weighted least squares.
+        """
+        _, place = np.unique(self._vertices, axis=0, return_inverse=True)
+        corners = place.ravel()[self._faces]
+        count = corners.max() + 1
+        # Other faces stay in their planes as far as possible: boxes remain boxes.
+        weight = np.where(self._distances > 0, 1.0, OTHER_FACES)
+        matrix = np.zeros((count, 3, 3))
+        right = np.zeros((count, 3))
+        products = weight[:, None, None] * self._normals[:, :, None] * self._normals[:, None, :]
+        targets = (-weight * self._distances)[:, None] * self._normals
+        for corner in corners.T:
+            np.add.at(matrix, corner, products)
+            np.add.at(right, corner, targets)
+        matrix += np.eye(3) * (OTHER_FACES * 1e-3)
+        return np.linalg.solve(matrix, right[:, :, None])[place.ravel(), :, 0]
+
+    def _touched(self) -> np.ndarray:
+        """Return the distance of each triangle to where the boundary has to end; 0 without contact.
+
+        Surfaces are searched for by rays from positions on the boundary: up to the offset of
+        Mitsuba's rays outside of it, and, as far as they are parallel to it, further within.
+        """
+        depth = max(TILT_DEPTH * self._size, self._clearance)
+        p, n, triangle = self._positions()
+        position, normal = (mi.Point3f(np.float32(v.T)) for v in (p, n))
+        ray = mi.Ray3f(position - mi.Float(depth) * mi.Vector3f(normal), mi.Vector3f(normal))
+        ray.maxt = mi.Float(depth + self._offset)
+        si = self._surfaces.ray_intersect(ray)
+        found = si.is_valid() & (dr.abs(dr.dot(si.n, ray.d)) > PARALLEL)
+        within = np.array(dr.select(found, mi.Float(depth) - si.t, -dr.inf), dtype=np.float64)
+        left = np.abs(within) <= self._offset
+        distances = np.zeros(len(self._faces))
+        while left.any():
+            # all positions and triangles in the plane of the first position that is left
+            first_p, first_n = p[left][0], n[left][0]
+            own = (n @ first_n > PARALLEL) & (np.abs((p - first_p) @ first_n) < self._offset)
+            if np.count_nonzero(own & left) >= FEWEST:
+                away = np.abs((self._vertices[self._faces] - first_p) @ first_n).max(axis=1)
+                same = (self._normals @ first_n > PARALLEL) & (away < self._offset)
+                same[triangle[own]] = True
+                distances[same] = max(within[own].max(), 0.0) + self._clearance
+            left &= ~own
+        return distances
+
+    def _positions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sample positions uniformly; return them, the normals there (n, 3), and the triangles."""
+        rng = np.random.default_rng(POSITIONS)
+        chosen = rng.choice(len(self._areas), POSITIONS, p=self._areas / self._areas.sum())
+        u, v = rng.random((2, POSITIONS, 1))
+        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+        a, b, c = self._vertices[self._faces[chosen].T]
+        return a + u * (b - a) + v * (c - a), self._normals[chosen], chosen
 
 
 def _mesh_like(shape: mi.Shape, vertices: np.ndarray) -> mi.Mesh:
@@ -194,38 +251,6 @@ def _mesh_like(shape: mi.Shape, vertices: np.ndarray) -> mi.Mesh:
     values.update()
     mesh.set_id(shape.id())
     return mesh
-
-
-def _contact(shape: mi.Shape, surfaces: mi.Scene, depth: float, offset: float) -> _Contact:
-    """Search for ``surfaces`` that are parallel to the boundary ``shape`` of a medium, up to a
-    ``depth`` within it, and up to the ``offset`` of rays outside of it.
-    """
-    p, n = _positions(shape)
-    position, normal = (mi.Point3f(np.float32(v.T)) for v in (p, n))
-    ray = mi.Ray3f(position - mi.Float(depth) * mi.Vector3f(normal), mi.Vector3f(normal))
-    ray.maxt = mi.Float(depth + offset)
-    si = surfaces.ray_intersect(ray)
-    found = si.is_valid() & (dr.abs(dr.dot(si.n, ray.d)) > PARALLEL)
-    within = np.array(dr.select(found, mi.Float(depth) - si.t, -dr.inf), dtype=np.float64)
-    return _Contact(p, n, within, np.abs(within) <= offset)
-
-
-def _positions(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Sample positions on a mesh uniformly, and return them with the outward normals of their
-    triangles (n, 3).
-    """
-    values = mi.traverse(mesh)
-    vertices = np.array(values["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-    a, b, c = vertices[np.array(values["faces"]).reshape(-1, 3).T]
-    across = np.cross(b - a, c - a)
-    areas = np.linalg.norm(across, axis=1)
-    rng = np.random.default_rng(POSITIONS)
-    chosen = rng.choice(len(areas), POSITIONS, p=areas / areas.sum())
-    u, v = rng.random((2, POSITIONS, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    p = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
-    n = (across / np.maximum(areas, 1e-300)[:, None])[chosen]
-    return p, -n if mesh.has_flipped_normals() else n
 
 
 def _warn(shape: mi.Shape) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from threading import Thread
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -97,6 +99,76 @@ def test_reversed_normals_are_refused(logged):
         compile_scene(scene)
 
 
+def corner_mesh(vertices: np.ndarray, faces: list, **properties) -> mi.Mesh:
+    """Return a mesh with other properties of shapes."""
+    props = mi.Properties()
+    for key, value in properties.items():
+        props[key] = value
+    mesh = mi.Mesh("mesh", len(vertices), len(faces), props=props)
+    values = mi.traverse(mesh)
+    values["vertex_positions"] = mi.Float(np.float32(vertices.ravel()))
+    values["faces"] = mi.UInt32(np.ravel(faces).astype(np.uint32))
+    values.update()
+    return mesh
+
+
+@pytest.mark.parametrize("height", [0.35, 1.2, 5.0])
+def test_attics(height):
+    """At acute edges, where moves of both faces add up, all faces end at the distance."""
+    flat = np.array([(-2, -1), (2, -1), (0, height - 1)])
+    vertices = np.array([(*p, z) for z in (-1, 1) for p in flat])
+    faces = [[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]]
+    medium, null = mi.load_dict(fog()), mi.load_dict({"type": "null"})
+    box = corner_mesh(vertices, faces, bsdf=null, interior=medium)
+    grey = mi.load_dict({"type": "diffuse"})
+    room = corner_mesh(vertices, faces, bsdf=grey, flip_normals=True)
+    made = mi.traverse(shape(separated(loaded(box, room=room)), "box"))
+    moved = np.array(made["vertex_positions"]).reshape(-1, 3) - vertices
+    expected = CLEARANCE * (1 + np.abs(vertices).max()) * RAY_OFFSET
+    for corners in faces:
+        a, b, c = vertices[corners]
+        normal = np.cross(b - a, c - a) / np.linalg.norm(np.cross(b - a, c - a))
+        np.testing.assert_allclose(moved[corners] @ normal, -expected, rtol=0.01)
+
+
+def test_opposite_faces_in_one_plane():
+    """Two boxes in one mesh, of which one ends where the other one begins, move apart."""
+    null = {"type": "null"}
+    low = bound(interior=ref("fog"), center=(-1.5, -0.5, 0), scale=(1, 0.5, 1))
+    high = bound(interior=ref("fog"), center=(1.5, 0.5, 0), scale=(1, 0.5, 1))
+    plate = {"type": "rectangle", "to_world": placed(scale=(4, 4, 1)).rotate([1, 0, 0], -90)}
+    objects = {"low": low | {"bsdf": ref("null")}, "high": high | {"bsdf": ref("null")}}
+    both_sides = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    scene = mi.load_dict(
+        {"type": "scene", "fog": fog(), "null": null, "plate": plate | {"bsdf": both_sides}}
+        | objects
+    )
+    (merged,) = [s for s in separated(scene).shapes() if s.interior_medium() is not None]
+    y = np.array(mi.traverse(merged)["vertex_positions"]).reshape(-1, 3)[:, 1]
+    gap = CLEARANCE * 3.5 * RAY_OFFSET
+    np.testing.assert_allclose(np.sort(np.unique(y.round(6))), [-1, -gap, gap, 1], atol=2e-6)
+
+
+def test_large_media_elsewhere_do_not_matter():
+    """The distance is that of a boundary's own coordinates."""
+    cloud = bound(interior=fog(), center=(0, 80, 0), scale=(500, 20, 500))
+    box = bound(interior=fog((2, 2, 2)))
+    result = separated(loaded(box, cloud=cloud, floor=floor()))
+    gap = CLEARANCE * 2 * RAY_OFFSET
+    assert abs(shape(result, "box").bbox().min.y - (-1 + gap)) < 1e-5
+
+
+def test_threads_do_not_see_other_names():
+    scene = loaded(floor=floor(), lamp=lamp((0, 3, 0), (0, 0, 0)))
+    ids = [s.id() for s in scene.shapes()]
+    threads = [Thread(target=lambda: [separated(scene) for _ in range(5)]) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [s.id() for s in scene.shapes()] == ids
+
+
 def test_names_remain():
     """Mitsuba renames objects that are passed to it in a dictionary."""
     smoke = bound(interior=fog() | {"id": "smoke"}) | {"bsdf": {"type": "null", "id": "clear"}}
@@ -133,13 +205,20 @@ def test_small_parts_of_large_meshes(merged):
 
 def test_nested_boxes_on_a_floor():
     """The inner box stays within the outer one."""
-    inner = bound(interior=fog((3, 3, 3)), center=(0, -0.5, 0), scale=(0.2, 0.5, 0.2))
-    objects = {"box": bound(interior=ref("air")), "inner": inner | {"exterior": ref("air")}}
-    scene = loaded(air=fog() | {"id": "air"}, floor=floor(), **objects)
-    result = separated(scene)
-    low = [shape(result, name).bbox().min.y for name in ("box", "inner")]
-    assert -1 + 3 * RAY_OFFSET < low[0] < low[1] - 3 * RAY_OFFSET
-    assert len(compile_scene(result).media.grids) == 2
+    names = ("box", "inner", "core")
+    media = {f"m{i}": fog((1 + i,) * 3) for i in range(3)}
+    boxes = {}
+    for i, name in enumerate(names):
+        size = 0.5**i
+        around = {"exterior": ref(f"m{i - 1}")} if i else {}
+        box = bound(
+            interior=ref(f"m{i}"), center=(0, size / 2 - 1, 0), scale=(size, size / 2, size)
+        )
+        boxes[name] = box | around
+    result = separated(loaded(floor=floor(), **media, **boxes))
+    low = [shape(result, name).bbox().min.y for name in names]
+    assert (np.diff([-1, *low]) > 3 * RAY_OFFSET).all()
+    assert len(compile_scene(result).media.grids) == 3
 
 
 @pytest.mark.parametrize("tilt", [2e-4, 1e-3, 3e-3])
