@@ -90,9 +90,10 @@ def among_surfaces(chosen: str) -> Table:
                 cells.append(row)
                 print("  ".join(row), flush=True)
     head = ["case", "parameter", "error", "noise", "cosine", "CPU s (cold image)"]
+    caches = SURROUNDED["room, sky"].caches
     note = (
         f"Times of image and gradient with {SPP_GRAD} samples, after the first, and of a cache and "
-        f"its image. Room: means over {SURROUNDED['room, sky'].caches} caches, whose noise is given."
+        f"its image. Room: means over {caches} caches, whose noise is given."
     )
     return Table("Gradients among surfaces and several media", head, cells, note)
 
