@@ -10,6 +10,8 @@ NODES = "tests/unit/cache/test_surface.py"
 IMAGES = "tests/system/test_surface_irradiance.py"
 GRADIENTS = "tests/system/test_gradients.py"
 TOLERANCE = "tests/system/test_tolerance.py"
+TOUCHING = "tests/unit/scene/test_clearance.py"
+AMONG_SURFACES = "tests/system/test_gradients_among_surfaces.py"
 
 SURFACES = (
     Mutant(
@@ -130,5 +132,47 @@ SURFACES = (
         "sum(part**2 for part in self.parts.values())",
         "max(part**2 for part in list(self.parts.values())[-1:])",
         (TOLERANCE,),
+    ),
+    Mutant(
+        "a boundary that surfaces touch keeps its place",
+        "scene/clearance.py",
+        "np.count_nonzero(own & left) >= FEWEST",
+        "np.count_nonzero(own & left) < 0",
+        (TOUCHING,),
+    ),
+    Mutant(
+        "moves of faces that meet are added",
+        "scene/clearance.py",
+        "np.linalg.solve(matrix, right[:, :, None])[place.ravel(), :, 0]",
+        "right[place.ravel()]",
+        (TOUCHING,),
+    ),
+    Mutant(
+        "a nested boundary moves as far as the one around it",
+        "scene/clearance.py",
+        "return CLEARANCE * _ray_offset(shape) + outer",
+        "return CLEARANCE * _ray_offset(shape)",
+        (TOUCHING,),
+    ),
+    Mutant(
+        "moved shapes keep the scene that was traced before",
+        "scene/clearance.py",
+        "    return isinstance(node, mi.Shape) or name",
+        "    return name",
+        (TOUCHING,),
+    ),
+    Mutant(
+        "depth of tilted floors ignored",
+        "scene/clearance.py",
+        "max(within[own].max(), 0.0) + self._clearance",
+        "self._clearance",
+        (TOUCHING,),
+    ),
+    Mutant(
+        "paths from voxels do not grow with the views",
+        "gradients/surroundings.py",
+        "self._samples += film.samples",
+        "self._samples = film.samples",
+        (AMONG_SURFACES,),
     ),
 )
