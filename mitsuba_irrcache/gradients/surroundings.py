@@ -62,7 +62,7 @@ class Surroundings:
     ) -> None:
         self._scene, self.media, self._hides = scene, media, hide_emitters
         self._kinds, self._seed = kinds, seed
-        self._samples = 0  # camera samples of the views so far
+        self._views, self._samples = 0, 0  # views so far, and their camera samples
         for number, medium in enumerate(media):
             self._complete(number, medium)
 
@@ -72,9 +72,10 @@ class Surroundings:
         events = int(from_camera) if self.media[0].single else None
         return PathAdjoint(self._scene, marched, *kinds, self._hides, events)
 
-    def _random(self, use: int, number: int, count: int) -> mi.PCG32:
+    def _random(self, use: int, number: int, count: int, view: int = 0) -> mi.PCG32:
         lanes = dr.arange(mi.UInt32, count)
         word = hashed_seed((self._seed & 0xFFFFFFFF, use << 16 | number))[0]
+        word = mi.sample_tea_32(word, dr.opaque(mi.UInt32, view))[0]
         return random_stream(mi.sample_tea_32(lanes, word))
 
     def _complete(self, number: int, medium: CoupledMedium) -> None:
@@ -116,13 +117,14 @@ class Surroundings:
         """Return the sums of derivatives at a fixed fluence, and the components of the adjoint
         fluence of camera rays for each medium and channel.
         """
+        self._views += 1
         self._samples += film.samples
         splats = None
         sees = self._scene.environment() is not None and not self._hides
         for number, each in enumerate(film.passes()):
             count = dr.width(each.ray.d)
             alpha = None if sees or each.alpha is None else -each.alpha
-            rng = self._random(CAMERA, number, count)
+            rng = self._random(CAMERA, number, count, self._views)
             paths = self._paths(from_camera=True)
             camera = mi.Ray3f(each.ray), each.radiance, alpha, None, rng
             paths.trace(Start(*camera, medium=film.medium))

@@ -67,6 +67,32 @@ def test_paths_from_voxels_are_as_many_as_camera_samples_need(
     assert sum(counts) == expected
 
 
+def test_images_in_one_loss_have_paths_of_their_own(mono, monkeypatch):
+    """Paths of all images had the same random numbers, so that more images did not reduce the noise
+    of a gradient.
+    """
+    scene = SURROUNDED["ground, sky"].load()
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("albedo.data"))
+    params.keep([key])
+    dr.enable_grad(params[key])
+    params.update()
+    drawn = []
+    trace = paths.PathAdjoint.trace
+
+    def recorded(self, start):
+        if start.adjoint_of_irradiance is None:
+            drawn.append(np.array(mi.PCG32(start.rng).next_uint32()))
+        return trace(self, start)
+
+    monkeypatch.setattr(paths.PathAdjoint, "trace", recorded)
+    # Images of several sensors usually have the same seed.
+    dr.backward(dr.mean(sum(mi.render(scene, params, spp=1, seed=seed) for seed in (0, 0, 1))))
+    assert len(drawn) == 3
+    for k in range(3):
+        assert np.mean(drawn[k] == drawn[k - 1]) < 1e-3
+
+
 # Other quick tests cover the slow cases: the test in colour has a floor and a sun, that of panes a
 # window, and `test_a_distant_object_changes_nothing` a distant object.
 @pytest.mark.parametrize(

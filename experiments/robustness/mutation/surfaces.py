@@ -175,4 +175,11 @@ SURFACES = (
         "self._samples = film.samples",
         (AMONG_SURFACES,),
     ),
+    Mutant(
+        "all images of a loss have the same paths",
+        "gradients/surroundings.py",
+        "word = mi.sample_tea_32(word, dr.opaque(mi.UInt32, view))[0]",
+        "word = mi.sample_tea_32(word, dr.opaque(mi.UInt32, 0))[0]",
+        (AMONG_SURFACES,),
+    ),
 )
