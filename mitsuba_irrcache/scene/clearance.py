@@ -74,8 +74,8 @@ def separated(scene: mi.Scene) -> mi.Scene | None:
     groups = [n for n in mi.traverse(scene).hierarchy if n.class_name() == "ShapeGroupPlugin"]
     surfaces = _scene_of([*groups, *filter(is_surface, shapes), *scene.sensors()])
     smaller = {}
-    for shape in boundaries:
-        boundary = _Boundary(shape, _clearance(shape, boundaries), surfaces)
+    for shape, clearance in _clearances(boundaries).items():
+        boundary = _Boundary(shape, clearance, surfaces)
         if boundary.is_touched:
             made = boundary.smaller()
             if made is None:
@@ -130,15 +130,24 @@ def _ray_offset(shape: mi.Shape) -> float:
     return float((1 + np.abs([box.min, box.max]).max()) * RAY_OFFSET)
 
 
-def _clearance(shape: mi.Shape, boundaries: list[mi.Shape]) -> float:
-    """Return the distance from surfaces at which a boundary is to end.
+def _clearances(boundaries: list[mi.Shape]) -> dict[mi.Shape, float]:
+    """Return the distance from surfaces at which each of the boundaries is to end.
 
-    A boundary within another one keeps a distance from that, too.
+    One within another keeps a distance from that, too.
     """
-    around = [b for b in boundaries if b.interior_medium() == shape.exterior_medium()]
-    others = [b for b in boundaries if b != shape]
-    outer = max((_clearance(b, others) for b in around if b in others), default=0.0)
-    return CLEARANCE * _ray_offset(shape) + outer
+    boxes = {b: (np.array(b.bbox().min), np.array(b.bbox().max)) for b in boundaries}
+    found: dict[mi.Shape, float] = {}
+    for shape in sorted(boundaries, key=lambda b: -np.linalg.norm(np.subtract(*boxes[b]))):
+        lower, upper = boxes[shape]
+        around = [
+            found[b]
+            for b in found
+            if b.interior_medium() == shape.exterior_medium()
+            and (boxes[b][0] <= lower).all()
+            and (boxes[b][1] >= upper).all()
+        ]
+        found[shape] = CLEARANCE * _ray_offset(shape) + max(around, default=0.0)
+    return found
 
 
 class _Boundary:
@@ -205,6 +214,9 @@ class _Boundary:
         Surfaces are searched for by rays from positions on the boundary: up to the offset of
         Mitsuba's rays outside of it, and, as far as they are parallel to it, further within.
         """
+        distances = np.zeros(len(self._faces))
+        if not 0 < self._areas.sum() < np.inf:
+            return distances  # no boundary: other checks refuse it
         depth = max(TILT_DEPTH * self._size, self._clearance)
         p, n, triangle = self._positions()
         position, normal = (mi.Point3f(np.float32(v.T)) for v in (p, n))
@@ -214,7 +226,6 @@ class _Boundary:
         found = si.is_valid() & (dr.abs(dr.dot(si.n, ray.d)) > PARALLEL)
         within = np.array(dr.select(found, mi.Float(depth) - si.t, -dr.inf), dtype=np.float64)
         left = np.abs(within) <= self._offset
-        distances = np.zeros(len(self._faces))
         while left.any():
             # all positions and triangles in the plane of the first position that is left
             first_p, first_n = p[left][0], n[left][0]

@@ -150,8 +150,8 @@ SURFACES = (
     Mutant(
         "a nested boundary moves as far as the one around it",
         "scene/clearance.py",
-        "return CLEARANCE * _ray_offset(shape) + outer",
-        "return CLEARANCE * _ray_offset(shape)",
+        "CLEARANCE * _ray_offset(shape) + max(around, default=0.0)",
+        "CLEARANCE * _ray_offset(shape)",
         (TOUCHING,),
     ),
     Mutant(

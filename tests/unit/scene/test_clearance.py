@@ -169,6 +169,12 @@ def test_threads_do_not_see_other_names():
     assert [s.id() for s in scene.shapes()] == ids
 
 
+def test_meshes_without_area_are_left_to_other_checks():
+    medium, null = mi.load_dict(fog()), mi.load_dict({"type": "null"})
+    flat = corner_mesh(np.zeros((3, 3)), [[0, 1, 2]], bsdf=null, interior=medium)
+    assert separated(loaded(flat=flat, floor=floor(-5.0))) is None
+
+
 def test_names_remain():
     """Mitsuba renames objects that are passed to it in a dictionary."""
     smoke = bound(interior=fog() | {"id": "smoke"}) | {"bsdf": {"type": "null", "id": "clear"}}
