@@ -42,8 +42,15 @@ def fills_a_room(gap: float) -> dict:
     return {"smoke": smoke, "lamp": lamp((0, 1 + gap, 0), (0, 0, 0), 0.4)} | sides
 
 
-@pytest.mark.parametrize("objects", [on_a_floor, fills_a_room])
-@pytest.mark.parametrize("solver", ["sweep", "path"])
+@pytest.mark.parametrize(
+    ("solver", "objects"),
+    [
+        ("sweep", on_a_floor),
+        ("sweep", fills_a_room),
+        ("path", on_a_floor),
+        pytest.param("path", fills_a_room, marks=pytest.mark.slow),
+    ],
+)
 def test_the_image_is_that_with_a_gap(scenes, objects, solver):
     integrator = {"type": "irrcache", "solver": solver, "resolution": 12, "cache_spp": 64}
     images = [
