@@ -41,6 +41,17 @@ def fewer_paths(monkeypatch):
     monkeypatch.setattr(surroundings, "EXCHANGED", 1 << 16)
 
 
+def with_gradient_of_albedo() -> tuple[mi.Scene, mi.SceneParameters]:
+    """Return a scene with a ground, and the albedo of its medium, which carries gradients."""
+    scene = SURROUNDED["ground, sky"].load()
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("albedo.data"))
+    params.keep([key])
+    dr.enable_grad(params[key])
+    params.update()
+    return scene, params
+
+
 @pytest.mark.parametrize(
     ("spp", "views", "expected"), [(4, 1, 1 << 16), (64, 1, 1 << 17), (64, 2, 1 << 18)]
 )
@@ -48,12 +59,7 @@ def test_paths_from_voxels_are_as_many_as_camera_samples_need(
     mono, monkeypatch, spp, views, expected
 ):
     """They cost most of a gradient, and the noise of the camera samples exceeds theirs."""
-    scene = SURROUNDED["ground, sky"].load()
-    params = mi.traverse(scene)
-    key = next(k for k in params.keys() if k.endswith("albedo.data"))
-    params.keep([key])
-    dr.enable_grad(params[key])
-    params.update()
+    scene, params = with_gradient_of_albedo()
     counts = []
     start = surroundings.Surroundings._from_voxels
 
@@ -71,12 +77,7 @@ def test_images_in_one_loss_have_paths_of_their_own(mono, monkeypatch):
     """Paths of all images had the same random numbers, so that more images did not reduce the noise
     of a gradient.
     """
-    scene = SURROUNDED["ground, sky"].load()
-    params = mi.traverse(scene)
-    key = next(k for k in params.keys() if k.endswith("albedo.data"))
-    params.keep([key])
-    dr.enable_grad(params[key])
-    params.update()
+    scene, params = with_gradient_of_albedo()
     drawn = []
     trace = paths.PathAdjoint.trace
 
