@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.scene.consistency import RAY_OFFSET, described
+from mitsuba_irrcache.scene.consistency import described, ray_offset
 from mitsuba_irrcache.scene.fingerprint import SceneVersion
 from mitsuba_irrcache.transport.path import is_surface
 
@@ -124,12 +124,6 @@ def _matters(name: str, node: mi.Object) -> bool:
     return isinstance(node, mi.Shape) or name.endswith("sampling_weight")
 
 
-def _ray_offset(shape: mi.Shape) -> float:
-    """Return by how much Mitsuba offsets rays from a shape."""
-    box = shape.bbox()
-    return float((1 + np.abs([box.min, box.max]).max()) * RAY_OFFSET)
-
-
 def _clearances(boundaries: list[mi.Shape]) -> dict[mi.Shape, float]:
     """Return the distance from surfaces at which each of the boundaries is to end.
 
@@ -146,7 +140,7 @@ def _clearances(boundaries: list[mi.Shape]) -> dict[mi.Shape, float]:
             and (boxes[b][0] <= lower).all()
             and (boxes[b][1] >= upper).all()
         ]
-        found[shape] = CLEARANCE * _ray_offset(shape) + max(around, default=0.0)
+        found[shape] = CLEARANCE * ray_offset(boxes[shape]) + max(around, default=0.0)
     return found
 
 
@@ -158,9 +152,9 @@ class _Boundary:
 
     def __init__(self, shape: mi.Shape, clearance: float, surfaces: mi.Scene) -> None:
         self._shape, self._clearance, self._surfaces = shape, clearance, surfaces
-        self._offset = _ray_offset(shape)
         values = mi.traverse(shape)
         self._vertices = np.array(values["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+        self._offset = ray_offset(self._vertices)
         self._faces = np.array(values["faces"]).reshape(-1, 3)
         a, b, c = self._vertices[self._faces.T]
         across = np.cross(b - a, c - a)

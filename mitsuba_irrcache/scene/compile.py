@@ -35,10 +35,10 @@ from mitsuba_irrcache.media.emission import Emission, check_emission_is_within
 from mitsuba_irrcache.media.medium import MediumContext, MediumGrid
 from mitsuba_irrcache.media.phase import Phase, refuse_sharp
 from mitsuba_irrcache.scene.consistency import (
-    RAY_OFFSET,
     check_media_agree,
     check_sensor,
     described,
+    ray_offset,
     warn_of_missing_medium,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
@@ -441,7 +441,7 @@ def _warn_of_scale(grids: Sequence[MediumGrid]) -> None:
     to their distance from the origin, is large compared to the medium.
     """
     for grid in grids:
-        offset = float((1 + np.abs(corners_of(grid.frame)).max()) * RAY_OFFSET)
+        offset = ray_offset(corners_of(grid.frame))
         size = np.linalg.norm(grid.frame[:3, :3], axis=0).min()
         if offset > LARGEST_OFFSET * size:
             mi.Log(

@@ -158,6 +158,11 @@ def camera_rays(sensor: mi.Sensor, count: int) -> tuple[mi.Ray3f, mi.Spectrum]:
     return sensor.sample_ray_differential(sensor.shutter_open(), 0.5, film, aperture)
 
 
+def ray_offset(positions: np.ndarray) -> float:
+    """Return by how much Mitsuba offsets secondary rays from surfaces at ``positions``, at most."""
+    return float((1 + np.abs(positions).max(initial=0.0)) * RAY_OFFSET)
+
+
 def described(shape: mi.Shape) -> str:
     """Describe a shape for a message, by its position if the scene does not name it."""
     if shape.id() and not shape.id().startswith("_unnamed"):
@@ -464,8 +469,8 @@ def _refuse_infinite(names: _Names, medium: int) -> None:
 
 def _refuse_close(scene: mi.Scene, names: _Names, first: int, second: int) -> None:
     """Raise the error for shapes that are closer to each other than Mitsuba's ray offset."""
-    corners = np.abs(bounds_of_shapes(scene))
-    offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
+    corners = bounds_of_shapes(scene)
+    offset = ray_offset(corners[np.isfinite(corners)])
     raise UnsupportedSceneError(
         f"irrcache: {names.shape(first)} is closer to {names.shape(second)} than Mitsuba's rays "
         f"resolve: they leave a surface at a distance of up to {offset:.1g} here, and miss what "

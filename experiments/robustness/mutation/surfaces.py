@@ -150,8 +150,8 @@ SURFACES = (
     Mutant(
         "a nested boundary moves as far as the one around it",
         "scene/clearance.py",
-        "CLEARANCE * _ray_offset(shape) + max(around, default=0.0)",
-        "CLEARANCE * _ray_offset(shape)",
+        "CLEARANCE * ray_offset(boxes[shape]) + max(around, default=0.0)",
+        "CLEARANCE * ray_offset(boxes[shape])",
         (TOUCHING,),
     ),
     Mutant(

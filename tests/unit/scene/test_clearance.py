@@ -245,12 +245,7 @@ def test_prisms_on_a_floor(tmp_path):
     for a in range(24):
         b = (a + 1) % 24
         faces += [[a, b, 24 + b], [a, 24 + b, 24 + a], [48, b, a], [49, 24 + a, 24 + b]]
-    mesh = mi.Mesh("prism", len(vertices), len(faces))
-    values = mi.traverse(mesh)
-    values["vertex_positions"] = mi.Float(np.float32(vertices.ravel()))
-    values["faces"] = mi.UInt32(np.ravel(faces).astype(np.uint32))
-    values.update()
-    mesh.write_ply(str(tmp_path / "prism.ply"))
+    corner_mesh(vertices, faces).write_ply(str(tmp_path / "prism.ply"))
     box = {"type": "ply", "filename": str(tmp_path / "prism.ply"), "interior": fog()}
     scene = loaded(box | {"bsdf": {"type": "null"}}, floor=floor())
     made = mi.traverse(shape(separated(scene), "box"))
