@@ -4,6 +4,7 @@ Mitsuba offsets every ray that leaves or crosses a shape. Where a floor lies in 
 that bounds a medium, a ray that crosses the face skips the floor, or begins beyond the face and
 stays in the wrong medium: the image is wrong there, also that of ``volpath``. Such a scene is
 replaced by one that has the same objects, but whose box ends a few offsets before the surface.
+Analytic shapes (spheres, disks) are not replaced, but named in a warning.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class SeparatedScene:
         distance from the meshes that bound media.
         """
         shapes = scene.shapes()
-        if not (any(map(_bounds_medium, shapes)) and any(map(is_surface, shapes))):
+        if not (any(map(_only_bounds_medium, shapes)) and any(map(is_surface, shapes))):
             self._version = self._separated = None
             return scene
         with dr.suspend_grad():
@@ -67,14 +68,19 @@ def separated(scene: mi.Scene) -> mi.Scene | None:
     touch them; None if no surface does.
     """
     shapes = scene.shapes()
-    boundaries = [*filter(_bounds_medium, shapes)]
+    boundaries = [*filter(_only_bounds_medium, shapes)]
     if not boundaries:
         return None
     # Groups of shapes, of which there may be instances, are not among the shapes of a scene.
     groups = [n for n in mi.traverse(scene).hierarchy if n.class_name() == "ShapeGroupPlugin"]
     surfaces = _scene_of([*groups, *filter(is_surface, shapes), *scene.sensors()])
     smaller = {}
-    for shape, clearance in _clearances(boundaries).items():
+    for shape in boundaries:
+        if not _has_vertices(shape) and _is_touched(shape, surfaces):
+            _warn(
+                shape
+            )  # a sphere, or a disk that closes a cylinder: they have no vertices to move
+    for shape, clearance in _clearances([*filter(_has_vertices, boundaries)]).items():
         boundary = _Boundary(shape, clearance, surfaces)
         if boundary.is_touched:
             made = boundary.smaller()
@@ -110,11 +116,32 @@ def _scene_of(objects: list[mi.Object]) -> mi.Scene:
     return scene
 
 
-def _bounds_medium(shape: mi.Shape) -> bool:
-    """Return whether a shape is a mesh that only bounds a medium."""
-    if not shape.is_mesh() or shape.interior_medium() is None or is_surface(shape):
-        return False
-    return "vertex_positions" in mi.traverse(shape)
+def _only_bounds_medium(shape: mi.Shape) -> bool:
+    """Return whether a shape bounds a medium without being a surface."""
+    return shape.interior_medium() is not None and not is_surface(shape)
+
+
+def _has_vertices(shape: mi.Shape) -> bool:
+    """Return whether a shape is a mesh."""
+    return shape.is_mesh() and "vertex_positions" in mi.traverse(shape)
+
+
+def _is_touched(shape: mi.Shape, surfaces: mi.Scene) -> bool:
+    """Return whether surfaces coincide with parts of an analytic shape.
+
+    They are searched for by rays from positions on it, up to the offset of Mitsuba's rays.
+    """
+    box = shape.bbox()
+    offset = ray_offset(np.array([box.min, box.max]))
+    samples = mi.Point2f(np.random.default_rng(POSITIONS).random((2, POSITIONS)))
+    found = shape.sample_position(0.0, samples)
+    # All values are arrays: Dr.Jit cannot compile an intersection with one direction for all rays.
+    position, normal = (np.array(v) for v in (found.p, found.n + 0 * found.p))
+    ray = mi.Ray3f(mi.Point3f(position - offset * normal), mi.Vector3f(normal))
+    ray.maxt = mi.Float(2 * offset)
+    si = surfaces.ray_intersect(ray)
+    touched = si.is_valid() & (dr.abs(dr.dot(si.n, ray.d)) > PARALLEL)
+    return dr.count(touched)[0] >= FEWEST
 
 
 def _matters(name: str, node: mi.Object) -> bool:

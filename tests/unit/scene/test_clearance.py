@@ -297,3 +297,31 @@ def test_the_second_scene_is_reused_until_shapes_move():
     third = edited("floor.to_world", mi.Transform4f(mi.Matrix4f(np.array(up.matrix))))
     assert third is not scene and separation.of(scene) is third
     assert separation.of(loaded(floor=floor())) is not third
+
+
+def closed_cylinder(height: float) -> dict:
+    """Return a cylinder of fog on ``y = height`` that two disks close."""
+    part = {"bsdf": {"type": "null"}, "interior": fog()}
+    up = mi.ScalarTransform4f().rotate([1, 0, 0], -90)
+    down = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], 90)
+    side = {"type": "cylinder", "p0": [0, height, 0], "p1": [0, 1, 0]} | part
+    top = {"type": "disk", "to_world": mi.ScalarTransform4f().translate([0, 1, 0]) @ up} | part
+    return {"side": side, "top": top, "bottom": {"type": "disk", "to_world": down} | part}
+
+
+@pytest.mark.parametrize(("height", "named"), [(0.0, ["bottom"]), (0.01, [])])
+def test_disks_on_a_floor_are_named(logged, height, named):
+    """Shapes without vertices are not moved."""
+    objects = closed_cylinder(height) | {"floor": floor(0), "sky": {"type": "constant"}}
+    assert separated(mi.load_dict({"type": "scene"} | objects, optimize=False)) is None
+    assert len(logged) == len(named)
+    assert all(f'face of shape "{name}" (Disk)' in logged[0] for name in named)
+
+
+@pytest.mark.parametrize(("radius", "named"), [(1.0, True), (1.00015, True), (1.01, False)])
+def test_spherical_rooms_are_named(logged, radius, named):
+    """A sphere of fog within walls of the same radius, and within wider ones."""
+    box = {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog()}
+    scene = loaded(box, walls={"type": "sphere", "radius": radius, "flip_normals": True})
+    assert separated(scene) is None
+    assert any("(Sphere)" in text for text in logged) == named
