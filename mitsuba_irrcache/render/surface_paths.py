@@ -30,7 +30,6 @@ from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
 from mitsuba_irrcache.render.surface_vertices import (
     facing,
-    first_opaque,
     lambertian,
     unobstructed,
     vertex_at,
@@ -224,8 +223,8 @@ class SurfacePaths:
         return PartlyOriginalMedia(self.media, self._original_media, narrow)
 
     def met_by_bsdf(self, scene, si, pointer, rng, active, exact: bool):
-        """Sample a ray from the BSDF at ``si``; return the reflected radiance of a sampled emitter
-        that it hits, with multiple importance sampling.
+        """Sample a ray from the BSDF at ``si``; return the reflected radiance of the sampled
+        emitters that it hits, with multiple importance sampling.
         """
         choice = rng.next_float32(active)
         u = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
@@ -236,16 +235,44 @@ class SurfacePaths:
         everywhere = mi.Bool(True)
         media = self._media_towards(vertex.p, direction, everywhere, everywhere, everywhere)
         ray = si.spawn_ray(direction)
-        end, passed, rng = first_opaque(scene, media, ray, pointer, rng, active, exact)
-        emitter = end.emitter(scene, active)
-        is_emitter = active & (emitter != None)  # noqa: E711
-        value = emitter.eval(end, is_emitter)
-        excess = self.emitters.excess(emitter, value)
-        is_emitter &= (excess > 0) & (dr.max(value) > 0)
-        record = mi.DirectionSample3f(scene, end, vertex)
-        density = emitter.pdf_direction(vertex, record, is_emitter)
-        weight = power_heuristic(sample.pdf, density)
-        return dr.select(is_emitter, f * value * excess * weight * passed, 0), rng
+        lines = ray, pointer, active
+        met, rng = self._emitters_along(scene, media, lines, vertex, sample.pdf, rng, exact)
+        return f * met, rng
+
+    @symbolic
+    def _emitters_along(self, scene, media, lines, vertex, density, rng, exact: bool):
+        """Return the attenuated radiance of the sampled emitters on ``lines`` from ``vertex``.
+
+        Surfaces that partly transmit are passed like null ones, as by `transport.path.visibility`:
+        both ways to find an emitter, of which this one has the ``density`` [1/sr], then see the
+        same emitters. ``lines`` are rays, their media, and which are active.
+        """
+        ray, pointer, active = mi.Ray3f(lines[0]), mi.MediumPtr(lines[1]), mi.Bool(lines[2])
+        total, attenuation, crossings = mi.Spectrum(0), mi.Spectrum(1), mi.UInt32(0)
+        while dr.hint(active, label="emitters met"):
+            si = scene.ray_intersect(ray, active)
+            if dr.hint(exact, mode="scalar"):
+                factor = media.exact_transmittance(pointer, ray, si.t, active)
+            else:
+                factor, rng = media.transmittance(pointer, ray, si.t, rng, active)
+            attenuation = dr.select(active, attenuation * factor, attenuation)
+            emitter = si.emitter(scene, active)
+            is_emitter = active & (emitter != None)  # noqa: E711
+            value = emitter.eval(si, is_emitter)
+            excess = self.emitters.excess(emitter, value)
+            is_emitter &= (excess > 0) & (dr.max(value) > 0)
+            record = mi.DirectionSample3f(scene, si, vertex)
+            weight = power_heuristic(density, emitter.pdf_direction(vertex, record, is_emitter))
+            total += dr.select(is_emitter, attenuation * value * excess * weight, 0)
+            hit = active & si.is_valid()
+            factor = si.bsdf().eval_null_transmission(si, hit)
+            attenuation = dr.select(hit, attenuation * factor, attenuation)
+            pointer = dr.select(hit, medium_after(si, ray.d, pointer), pointer)
+            ray = si.spawn_ray(ray.d)
+            crossings += 1
+            active &= hit & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)
+        # A line that exceeds the maximum number of crossings does not contribute.
+        return dr.select(crossings < MOST_CROSSINGS, total, 0), rng
 
     @symbolic
     def scattered_forward(self, scene, ray, pointer, rng, active):

@@ -1,4 +1,4 @@
-"""Surfaces that rays hit: the first one that is not null, its normals, whether it is diffuse."""
+"""Surfaces that rays hit: whether any is not null, their normals, whether they are diffuse."""
 
 from __future__ import annotations
 
@@ -6,56 +6,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.transport.path import (
-    MOST_CROSSINGS,
-    Media,
-    PartlyOriginalMedia,
-    is_null,
-    medium_after,
-)
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
 #: Largest relative difference of f in three directions for which a BSDF counts as Lambertian.
 LAMBERTIAN = 1e-4
-
-
-@symbolic
-def first_opaque(
-    scene: mi.Scene,
-    media: Media | PartlyOriginalMedia,
-    ray: mi.Ray3f,
-    pointer: mi.MediumPtr,
-    rng: mi.PCG32,
-    active: mi.Bool,
-    exact: bool,
-):
-    """Find the first surface along ``ray`` that emits or lets nothing through, invalid where there
-    is none.
-
-    Surfaces that partly transmit are passed like null ones, as by `transport.path.visibility`: the
-    densities of a sampled emitter then count both ways to find it. Returns the surface with the
-    transmittance of what lies before it, without noise if ``exact``, and the random generator.
-    """
-    ray, pointer, active = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(active)
-    end, attenuation = dr.zeros(mi.SurfaceInteraction3f), mi.Spectrum(1)
-    crossings = mi.UInt32(0)
-    while dr.hint(active, label="first opaque surface"):
-        si = scene.ray_intersect(ray, active)
-        if dr.hint(exact, mode="scalar"):
-            factor = media.exact_transmittance(pointer, ray, si.t, active)
-        else:
-            factor, rng = media.transmittance(pointer, ray, si.t, rng, active)
-        attenuation = dr.select(active, attenuation * factor, attenuation)
-        hit = active & si.is_valid()
-        factor = si.bsdf().eval_null_transmission(si, hit)
-        null = hit & (si.emitter(scene, hit) == None) & (dr.max(factor) > 0)  # noqa: E711
-        end = dr.select(active & ~null, si, end)
-        attenuation = dr.select(null, attenuation * factor, attenuation)
-        pointer = dr.select(null, medium_after(si, ray.d, pointer), pointer)
-        ray = si.spawn_ray(ray.d)
-        crossings += 1
-        active &= null & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)
-    # A line that exceeds the maximum number of crossings does not contribute.
-    return end, dr.select(crossings < MOST_CROSSINGS, attenuation, 0), rng
 
 
 @symbolic

@@ -92,6 +92,7 @@ def compile_scene(
         check_placement(emitter)
         _warn_of_weight(emitter)
         _warn_of_normals(emitter)
+        _check_radiance(emitter)
     _warn_of_lost_bounds(scene)
     for sensor in scene.sensors():
         check_sensor(scene, sensor)
@@ -459,6 +460,18 @@ def _warn_of_weight(emitter: mi.Emitter) -> None:
             mi.LogLevel.Warn,
             f'irrcache: emitter "{emitter.id()}" has sampling_weight 0 and does not illuminate the '
             "scene, as with Mitsuba's integrators, which never sample it.",
+        )
+
+
+def _check_radiance(emitter: mi.Emitter) -> None:
+    """Refuse emitters whose radiance Mitsuba evaluates to 0 wherever it samples a position."""
+    texture = children(emitter).get("radiance")
+    if texture is not None and texture.class_name() == "MeshAttribute":
+        raise UnsupportedSceneError(
+            f'irrcache: the radiance of {described(emitter.get_shape())} is a "mesh_attribute", '
+            "which Mitsuba evaluates to 0 at positions that it samples on a mesh: with volpath, "
+            "too, such an emitter hardly illuminates the scene. Use a bitmap as its radiance, or a "
+            "mesh for each value."
         )
 
 

@@ -118,14 +118,17 @@ def many_lights() -> dict:
 
 
 def filtered_lamps() -> dict:
-    """Return a floor under a large lamp behind a half transparent sheet, and one without a BSDF."""
+    """Return a floor under a large lamp behind a half transparent sheet that emits, too, and one
+    without a BSDF.
+    """
     half = {"type": "mask", "opacity": 0.5, "nested": {"type": "twosided", "n": diffuse(0.2, 0, 0)}}
     return {
         "smoke": bound(interior=fog(), center=(0, 0.2, 0.8), scale=(0.5, 0.3, 0.3)),
         "floor": ground(-0.9),
         "behind": lamp((-1.3, 1.3, 0), (-1.3, 0, 0.001), 1.2, (2, 2, 2)),
-        "sheet": wall((-1.3, 1.1, 0), (-1.3, 0, 0.001), half) | {
-            "to_world": placed((-1.3, 1.1, 0), (1.3, 1.3, 1), (-1.3, 0, 0.001))
+        "sheet": wall((-1.3, 0.9, 0), (-1.3, 0, 0.001), half) | {
+            "to_world": placed((-1.3, 0.9, 0), (1.3, 1.3, 1), (-1.3, 0, 0.001)),
+            "emitter": {"type": "area", "radiance": 0.05},
         },
         "null": lamp((1.3, 1.1, 0), (1.3, 0, 0.001), 1.2, (1, 2, 3)) | {"bsdf": {"type": "null"}},
     }  # fmt: skip

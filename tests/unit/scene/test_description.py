@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.lights.emitters import EmitterKind
 from mitsuba_irrcache.media.bake_emission import bake_emission
 from mitsuba_irrcache.scene.compile import compile_scene
@@ -202,3 +203,26 @@ def test_media_far_from_the_origin_are_noted(monkeypatch, distance, floor, warns
     ground = {"type": "rectangle", "to_world": place}
     compile_scene(mi.load_dict({"type": "scene", "box": box, "ground": ground}))
     assert sum("rays that leave surfaces near it skip" in text for text in messages) == warns
+
+
+def test_emitters_that_mitsuba_samples_as_black_are_refused(scenes, tmp_path):
+    """Mitsuba evaluates vertex colours to 0 at sampled positions. Media near such a lamp were black
+    without a message.
+    """
+    mesh = mi.Mesh("quad", 3, 1)
+    mesh.add_attribute("vertex_color", 3, [4.0] * 9)
+    values = mi.traverse(mesh)
+    values["vertex_positions"], values["faces"] = [0, 3, 0, 1, 3, 0, 0, 3, 1], [0, 1, 2]
+    values.update()
+    mesh.write_ply(str(tmp_path / "lamp.ply"))
+    radiance = {"type": "mesh_attribute", "name": "vertex_color"}
+    area = {"type": "area", "radiance": radiance}
+    lamp = {"type": "ply", "filename": str(tmp_path / "lamp.ply"), "emitter": area}
+    scene = scenes.load(
+        {"type": "volpath"},
+        None,
+        box=scenes.boundary(scenes.medium(1.0, 0.5), scenes.placement()),
+        lamp=lamp,
+    )
+    with pytest.raises(UnsupportedSceneError, match='"lamp".*"mesh_attribute"'):
+        compile_scene(scene)
