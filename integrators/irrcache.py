@@ -237,11 +237,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     medium, by ``g`` of its phase function ``hg``, and by the radiance of emitters, by solving the
     adjoint transport equation with the solver ``sweep``, for one medium in a box or sphere under
     distant and point emitters (not inside of it if delta-M applies), with ``max_depth`` 1, 2 or -1,
-    no filter and no ``aovs``. Emissive media have gradients by ``emission`` only. Surfaces, area
-    emitters and several media may be around media that do not emit if ``max_depth`` is 2 or -1;
-    ``dr.backward`` then has gradients by the reflectance of ``diffuse`` BSDFs instead of ``g``. In
-    isotropic media without surfaces there are also gradients by ``position`` of points and
-    ``to_world`` of suns. All other gradients are refused with an error that names the parameter.
+    no filter and no ``aovs``. There may be emission, surfaces, area emitters and several media if
+    ``max_depth`` is 2 or -1, and ``dr.backward`` is called; there are gradients by the reflectance
+    of ``diffuse`` BSDFs, too. In isotropic media without surfaces there are also gradients by
+    ``position`` of points and ``to_world`` of suns. All other gradients are refused with an error
+    that names the parameter.
     While parameters carry gradients, the grid of the cache is kept. Images of the same state of the
     scene in one loss share one adjoint solve; ``cache_spp`` also sets its directions.
 
@@ -576,7 +576,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self, scene: mi.Scene, params: mi.SceneParameters, keys: list[str], seed: int
     ) -> ParameterAdjoint | TracedAdjoint:
         """Return the derivatives of images of ``scene`` by the parameters ``keys``."""
-        from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check
+        from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check, needs_paths
         from mitsuba_irrcache.gradients.traced import TracedAdjoint
 
         self._source.refuse_tolerance("an objective would jump with the resolution")
@@ -584,11 +584,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         scene = self._separated(scene)
         camera_rays = self._prepared(scene)
         parts, rays = self._builder.parts, self._options.rays
-        check(parts, keys, rays.layered)
-        if not parts[0].medium.is_isolated:
-            image = rays.step, rays.hide_emitters
+        emission = self._options.emission
+        traced = needs_paths(parts, params, keys, emission)
+        check(parts, keys, rays.layered, traced)
+        if traced:
+            image = rays.step, rays.hide_emitters, emission
             return TracedAdjoint(scene, params, keys, parts, image, seed)
-        image = camera_rays, rays.step, self._options.emission
+        image = camera_rays, rays.step, emission
         return ParameterAdjoint(scene, params, keys, parts[0], image, seed)
 
     def to_string(self) -> str:

@@ -19,6 +19,9 @@ from mitsuba_irrcache.gradients.parameters import (
     Placement,
     by_parameter,
     channels_of,
+    check_emission,
+    check_mean_cosine,
+    nodes_of_emission,
     refuse,
     refuse_all,
     roles_of,
@@ -45,8 +48,27 @@ EMITTERS = frozenset(
 )
 
 
-def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
-    """Raise IrrcacheError for scenes and settings in which no gradients are computed."""
+def needs_paths(
+    parts: list[CachedMedium], params: mi.SceneParameters, keys: list[str], emission: object
+) -> bool:
+    """Return whether `TracedAdjoint` computes the derivatives with respect to ``keys``.
+
+    ``emission`` is the integrator's property. `ParameterAdjoint` needs an isolated medium, and has
+    no derivatives of emissive media but those with respect to the emission.
+    """
+    if not parts or not parts[0].medium.is_isolated:
+        return bool(parts)
+    if parts[0].medium.emission is None:
+        return False
+    own = nodes_of_emission(emission)
+    return any(params.properties[key][2] not in own for key in keys)
+
+
+def check(parts: list[CachedMedium], keys: list[str], layered: bool, traced: bool) -> None:
+    """Raise IrrcacheError for scenes and settings in which no gradients are computed.
+
+    ``traced`` is the result of `needs_paths`.
+    """
     if not parts:
         refuse_all(
             keys,
@@ -56,7 +78,7 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
     if layered:
         refuse_all(keys, "the image is filtered or has aovs", "Set filter to none and no aovs")
     part, medium = parts[0], parts[0].medium
-    if not medium.is_isolated:
+    if traced:
         check_traced(parts, keys)
         return
     name = f'medium "{medium.name}"'
@@ -119,11 +141,15 @@ class ParameterAdjoint:
         roles = roles_of(params, keys, medium, scene, emission)
         self._keys, self._roles = keys, roles
         self._of_medium = {k: role for k, role in roles.items() if isinstance(role, str)}
-        _check_mean_cosine(part, self._of_medium)
+        for key, role in self._of_medium.items():
+            if role == MEAN_COSINE:
+                check_mean_cosine(key, part.medium)
         self._placed = {k: role for k, role in roles.items() if isinstance(role, Placement)}
         if part.cache is not None:
             check_placements(self._placed, part.cache.grid)
-        _check_emission(part, self._of_medium)
+        for key, role in self._of_medium.items():
+            if role == EMISSION:
+                check_emission(key, part.medium)
         emitters = [role for role in roles.values() if isinstance(role, mi.Emitter)]
         self._emitters = EmitterAdjoint(scene, emitters)
 
@@ -207,26 +233,3 @@ def check_placements(placed: dict[str, Placement], grid: Grid) -> None:
             continue
         if lies_in(role.emitter, grid):
             refuse(key, "the light is in the medium, or within a voxel of it")
-
-
-def _check_mean_cosine(part: CachedMedium, of_medium: dict[str, str]) -> None:
-    """Refuse derivatives by a mean cosine of 0, for which the cache has no moments."""
-    if not part.medium.phase.is_isotropic:
-        return
-    for key, role in of_medium.items():
-        if role == MEAN_COSINE:
-            refuse(key, "it is 0, where scattering is isotropic; start with 0.01 or -0.01")
-
-
-def _check_emission(part: CachedMedium, of_medium: dict[str, str]) -> None:
-    """Refuse derivatives by a medium that emits, and by emission that is 0 everywhere."""
-    name = f'medium "{part.medium.name}"'
-    others = [key for key, role in of_medium.items() if role != EMISSION]
-    if part.medium.emission is not None and others:
-        refuse_all(others, f"{name} is emissive", "Remove the emission")
-    if part.medium.emission is None and len(others) < len(of_medium):
-        refuse_all(
-            [key for key in of_medium if key not in others],
-            "the emission is 0 everywhere, and ignored",
-            "Start with a small positive value",
-        )

@@ -6,6 +6,7 @@ have those of `scattering`: moments, and the irradiance of each narrow source.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,14 +32,16 @@ from mitsuba_irrcache.gradients.medium import (
     sums_for,
     warn_of_aureole,
 )
-from mitsuba_irrcache.gradients.parameters import ALBEDO, SIGMA_T
+from mitsuba_irrcache.gradients.parameters import ALBEDO, EMISSION, MEAN_COSINE, SIGMA_T
+from mitsuba_irrcache.gradients.phase_function import NeighbouringPhases
 from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, InScattering
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
 from mitsuba_irrcache.gradients.scattering import Components, IsotropicScattering
-from mitsuba_irrcache.gradients.splatting import VoxelSums
+from mitsuba_irrcache.gradients.splatting import ConstantSplat, VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, TransportSettings
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.narrow_sources import Source, sources_of
+from mitsuba_irrcache.media.phase import Phase
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 
 
@@ -87,6 +90,14 @@ class KnownFluence:
             higher = zip(*(components[1:] for components in values), strict=True)
             moments = [layer for channels in higher for layer in channels]
             self.angular = InScattering(AngularField(basis, grid, irradiance, moments), basis)
+        self._basis = basis
+
+    def scattered_by(self, phase: Phase) -> KnownFluence:
+        """Return this fluence with another ``phase`` function for scattering into rays."""
+        fluence, own = copy(self), self._basis
+        basis = AngularBasis(phase, own.sources, order=own.order)
+        fluence.angular = self.angular.in_basis(basis)
+        return fluence
 
 
 class Importance:
@@ -164,6 +175,8 @@ class CoupledMedium:
         #: numbers of channels of the derivatives to return and of the sums for them, by role
         self.wanted, self._summed = wanted, sums_for(part.medium, wanted)
         self.cache, self.grid = part.cache, part.cache.grid
+        #: for derivatives with respect to the mean cosine
+        self._phases = NeighbouringPhases(part.medium.phase) if MEAN_COSINE in wanted else None
         #: whether radiance is scattered once only
         self.single = part.settings.max_depth == 2
         settings = TransportSettings(
@@ -238,7 +251,14 @@ class CoupledMedium:
 
     def _update(self) -> None:
         fluence = KnownFluence(self.grid, self.values, self.cache.border, self.basis)
-        self.march = CameraReplay(self.medium, fluence, None, self.step)
+        neighbours = None
+        if self._phases is not None:
+            marches = [
+                CameraReplay(self.medium, fluence.scattered_by(phase), None, self.step)
+                for phase in (self._phases.below, self._phases.above)
+            ]
+            neighbours = (*marches, self._phases.step)
+        self.march = CameraReplay(self.medium, fluence, None, self.step, neighbours)
 
     def moments(
         self, p: mi.Point3f, contributions: list[tuple[mi.Vector3f, mi.Spectrum, mi.Spectrum]]
@@ -284,26 +304,41 @@ class CoupledMedium:
         if collisions:
             bound = largest * count * MARGIN * peak
             sums = VoxelSums(self.grid, self.channels * self.components, bound)
-        found = {SIGMA_T: None, ALBEDO: None}
+        found = dict.fromkeys((SIGMA_T, ALBEDO, EMISSION, MEAN_COSINE))
         if derivatives:
             length = float(np.linalg.norm(self.grid.side_lengths))
             mean = self.march.irradiance.maximum * peak / (4 * np.pi)
-            bounds = {SIGMA_T: largest * (1 + mean) * length, ALBEDO: largest * mean}
-            found |= {
-                role: splat_of(field_of(self.medium, role), own, bounds[role] * count * MARGIN)
-                for role, own in self._summed.items()
+            emission = self.medium.emission
+            emitted = 0.0 if emission is None else emission.maximum * length
+            bounds = {
+                SIGMA_T: largest * (1 + mean + emitted) * length,
+                ALBEDO: largest * mean,
+                EMISSION: largest * length,
             }
-        return CameraSplats(found[SIGMA_T], found[ALBEDO], sums)
+            for role, own in self._summed.items():
+                if role == MEAN_COSINE:
+                    found[role] = ConstantSplat(1, largest * mean * count * MARGIN**2)
+                    continue
+                bound = bounds[role] * count * MARGIN
+                found[role] = splat_of(field_of(self.medium, role), own, bound)
+        sigma_t, albedo, emission, g = found.values()
+        return CameraSplats(sigma_t, albedo, sums, emission, g=g)
 
     def derivatives(self, splats: CameraSplats) -> dict[str, mi.Float]:
         """Return the ``wanted`` derivatives with respect to the scene's medium, by role, at the
         voxels of its data, given those with respect to the medium as it is rendered.
         """
-        sums = {SIGMA_T: splats.sigma_t, ALBEDO: splats.albedo}
+        sums = {
+            SIGMA_T: splats.sigma_t,
+            ALBEDO: splats.albedo,
+            EMISSION: splats.emission,
+            MEAN_COSINE: splats.g,
+        }
         found = {role: sums[role].values() for role in self._summed}
-        if self.medium.original is None or not found:
+        if self.medium.original is None or found.keys() <= {EMISSION}:
             return found
-        return with_forward_peak(self.medium, found, self._summed[SIGMA_T], self.wanted)
+        change = self._phases.forward if self._phases is not None else 0.0
+        return with_forward_peak(self.medium, found, self._summed[SIGMA_T], self.wanted, change)
 
 
 def _index(sources: list[Source], source: Source) -> int:

@@ -12,6 +12,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.film import LUMINANCE
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.media.bake import children
+from mitsuba_irrcache.media.medium import MediumGrid
 
 #: Roles of a parameter in a medium.
 SIGMA_T, ALBEDO, EMISSION, MEAN_COSINE = "sigma_t", "albedo", "emission", "g"
@@ -74,7 +75,7 @@ def roles_of(
     for key in keys:
         node = params.properties[key][2]
         placed = PLACED.get(node.class_name()) == key.rpartition(".")[2]
-        if node == medium.phase_function() and node.class_name() == "HGPhaseFunction":
+        if is_mean_cosine(params, key, medium):
             roles[key] = MEAN_COSINE
         elif placed and medium.phase_function().class_name() == "IsotropicPhaseFunction":
             roles[key] = Placement(node)
@@ -83,6 +84,25 @@ def roles_of(
             if isinstance(roles[key], SharedTexture):
                 refuse(key, "several emitters depend on it; give each a texture of its own")
     return roles
+
+
+def is_mean_cosine(params: mi.SceneParameters, key: str, medium: mi.Medium) -> bool:
+    """Return whether a parameter is the mean cosine of the phase function ``hg`` of a medium."""
+    node = params.properties[key][2]
+    return node == medium.phase_function() and node.class_name() == "HGPhaseFunction"
+
+
+def check_mean_cosine(key: str, medium: MediumGrid) -> None:
+    """Refuse derivatives by a mean cosine of 0, for which the cache has no moments."""
+    if medium.phase.is_isotropic:
+        refuse(key, "it is 0, where scattering is isotropic; start with 0.01 or -0.01")
+
+
+def check_emission(key: str, medium: MediumGrid) -> None:
+    """Refuse derivatives by an emission of 0 everywhere, which is ignored."""
+    if medium.emission is None:
+        reason = "the emission is 0 everywhere, and ignored"
+        refuse_all([key], reason, "Start with a small positive value")
 
 
 def role_of(params: mi.SceneParameters, key: str, nodes: Mapping[mi.Object, object]) -> object:
@@ -105,9 +125,7 @@ def nodes_of_medium(
     """Return the roles of the volumes of a ``medium``, and of objects within these."""
     own = children(medium)
     volumes = {SIGMA_T: own["sigma_t"], ALBEDO: own["albedo"]}
-    if isinstance(emission, mi.Volume):
-        volumes[EMISSION] = emission
-    nodes: dict[mi.Object, str] = {}
+    nodes: dict[mi.Object, str] = dict.fromkeys(nodes_of_emission(emission), EMISSION)
     for role, volume in volumes.items():
         for node in (volume, *children(volume).values()):
             if nodes.get(node, role) != role:
@@ -115,6 +133,13 @@ def nodes_of_medium(
                 refuse(key_of_node(params, keys, node, SIGMA_T), reason)
             nodes[node] = role
     return nodes
+
+
+def nodes_of_emission(emission: object) -> tuple[mi.Object, ...]:
+    """Return the integrator's volume ``emission`` and objects within it; nothing if it is none."""
+    if not isinstance(emission, mi.Volume):
+        return ()
+    return emission, *children(emission).values()
 
 
 def nodes_of_emitters(scene: mi.Scene) -> dict[mi.Object, mi.Emitter | SharedTexture]:
@@ -150,7 +175,7 @@ def refuse(key: str, reason: str) -> None:
     """Raise IrrcacheError for a parameter with respect to which no gradient is computed."""
     raise IrrcacheError(
         f'irrcache computes no gradient of the parameter "{key}": {reason}. It has gradients of '
-        "sigma_t and albedo of a medium, and of radiance; without surfaces of g of hg, of emission "
+        "sigma_t, albedo and g of hg of a medium, and of radiance; without surfaces of emission "
         "and, in isotropic media, of positions of points and directions of suns; among surfaces of "
         "diffuse reflectance; detach this "
         'parameter (dr.disable_grad, params.update), or use the integrator "prbvolpath".'

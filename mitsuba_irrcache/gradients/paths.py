@@ -514,7 +514,7 @@ class PathAdjoint:
                 march, own = marches[number], splats[number]
                 rays = RaySegments(segment.ray, near, far, passed, segment.offset, hit & mask)
                 if march.irradiance is None:  # nothing is scattered, so that nothing collides
-                    own = CameraSplats(own.sigma_t, None, None)
+                    own = CameraSplats(own.sigma_t, None, None, own.emission)
                 march.replay(rays, ahead, mi.Spectrum(0), own)
         dr.eval()
         if self._emitters:

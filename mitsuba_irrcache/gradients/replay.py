@@ -1,7 +1,8 @@
 """Derivatives of camera rays by path replay, and the adjoint fluence of the rays in the medium.
 
-A ray's radiance is L = sum_k T_k (1 - e^-tau_k) q_k + T B, with the source q = albedo Phi / (4 pi)
-in the middle of each step, and the radiance B behind the medium. Each ray is marched twice: first
+A ray's radiance is L = sum_k T_k [(1 - e^-tau_k) q_k + s(tau_k) l_k j_k] + T B, with the source
+q = albedo Phi / (4 pi) and the emission j in the middle of each step of length l, the mean
+transmittance s of a step, and the radiance B behind the medium. Each ray is marched twice: first
 to compute L, then to compute derivatives, which depend on the radiance ahead of each step: L minus
 the contributions of the previous steps. Like path replay backpropagation (Vicini, Speierer and
 Jakob 2021), this needs no memory per step.
@@ -124,6 +125,23 @@ class InScattering:
         return [mi.Float(1), *moments, *gains]
 
 
+def _mean_transmittance(tau: mi.Spectrum, absorbed: mi.Spectrum) -> mi.Spectrum:
+    """Return the mean transmittance (1 - e^-tau) / tau from positions within a step to its start.
+
+    ``absorbed`` is 1 - e^-tau.
+    """
+    thin = tau < 1e-4
+    return dr.select(thin, 1 - 0.5 * tau, absorbed / dr.select(thin, 1, tau))
+
+
+def _derivative_of_mean_transmittance(tau: mi.Spectrum, absorbed: mi.Spectrum) -> mi.Spectrum:
+    """Return the derivative of `_mean_transmittance` with respect to ``tau``."""
+    thin = tau < 0.05
+    series = dr.fma(tau, dr.fma(tau, dr.fma(tau, 1 / 30, -1 / 8), 1 / 3), -1 / 2)
+    exact = (dr.fma(1 - absorbed, 1 + tau, -1)) / dr.square(dr.select(thin, 1, tau))
+    return dr.select(thin, series, exact)
+
+
 class FluenceAlongRays(Protocol):
     """Fields of the fluence, see `FluenceFields`."""
 
@@ -181,6 +199,9 @@ class CameraReplay:
             return self
         march = copy(self)
         march._angular = self._angular.indirect()
+        if self._neighbours is not None:
+            marches, factor = self._neighbours
+            march._neighbours = [each.indirect() for each in marches], factor
         return march
 
     def sigma_t(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
@@ -188,6 +209,12 @@ class CameraReplay:
 
     def albedo(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
         return mi.Spectrum(self.medium.albedo.at_world(p, active))
+
+    def emitted(self, p: mi.Point3f, length: mi.Float, active: mi.Bool) -> mi.Spectrum:
+        """Return the radiance that is emitted along a step of this ``length`` around ``p``."""
+        if self.medium.emission is None:
+            return mi.Spectrum(0)
+        return mi.Spectrum(self.medium.emission.at_world(p, active)) * length
 
     def view(self, direction: mi.Vector3f) -> tuple:
         """Evaluate what `mean_radiance` needs of the ``direction`` of rays."""
@@ -246,10 +273,14 @@ class CameraReplay:
         transmittance, active = mi.Spectrum(1), mi.Bool(active) & (near < far)
         while dr.hint(active, label="camera rays"):
             end = minimum(dr.fma(k + offset, self.step, near), far)
-            p = ray(0.5 * (t + end))
-            absorbed = absorptance(self.sigma_t(p, active) * (end - t))
+            p, length = ray(0.5 * (t + end)), end - t
+            tau = self.sigma_t(p, active) * length
+            absorbed = absorptance(tau)
             source = self.albedo(p, active) * self.mean_radiance(p, active, view)
             total += transmittance * absorbed * source
+            if dr.hint(self.medium.emission is not None, mode="scalar"):
+                emitted = self.emitted(p, length, active)
+                total += transmittance * _mean_transmittance(tau, absorbed) * emitted
             transmittance *= 1 - absorbed
             t = end
             k += 1
@@ -302,16 +333,21 @@ class CameraReplay:
             absorbed = absorptance(tau)
             mean, albedo = self.mean_radiance(p, active, view), self.albedo(p, active)
             ahead -= passed * absorbed * albedo * mean
+            share, emitted = mi.Spectrum(1), mi.Spectrum(0)
+            if dr.hint(self.medium.emission is not None, mode="scalar"):
+                share = _mean_transmittance(tau, absorbed)
+                emitted = passed * self.emitted(p, length, active)
+                ahead -= share * emitted
             following = passed * (1 - absorbed)
             if dr.hint(splats.sigma_t is not None, mode="scalar"):
                 change = length * (following * albedo * mean - ahead)
+                if dr.hint(self.medium.emission is not None, mode="scalar"):
+                    change += length * emitted * _derivative_of_mean_transmittance(tau, absorbed)
                 splats.sigma_t.add(p, summed_to_channels(change, splats.sigma_t.channels), active)
             if dr.hint(splats.albedo is not None, mode="scalar"):
                 change = passed * absorbed * mean
                 splats.albedo.add(p, summed_to_channels(change, splats.albedo.channels), active)
             if dr.hint(splats.emission is not None, mode="scalar"):
-                thin = tau < 1e-4
-                share = dr.select(thin, 1 - 0.5 * tau, absorbed / dr.select(thin, 1, tau))
                 change = summed_to_channels(passed * share * length, splats.emission.channels)
                 splats.emission.add(p, change, active & self.medium.emission.covers(p))
             if dr.hint(splats.collisions is not None, mode="scalar"):

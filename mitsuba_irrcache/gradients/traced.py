@@ -15,10 +15,16 @@ from mitsuba_irrcache.gradients.coupled_medium import CoupledMedium
 from mitsuba_irrcache.gradients.film import FilmAdjoint
 from mitsuba_irrcache.gradients.medium import field_of, original_of
 from mitsuba_irrcache.gradients.parameters import (
+    EMISSION,
+    MEAN_COSINE,
     add_user,
     by_parameter,
     channels_of,
+    check_emission,
+    check_mean_cosine,
+    is_mean_cosine,
     key_of_node,
+    nodes_of_emission,
     nodes_of_emitters,
     nodes_of_medium,
     refuse,
@@ -47,8 +53,8 @@ def check(parts: list[CachedMedium], keys: list[str]) -> None:
     if settings.max_depth not in (2, -1):
         refuse_all(
             keys,
-            f"max_depth is {settings.max_depth} and there are surfaces, area lights or several "
-            "media",
+            f"max_depth is {settings.max_depth} and there are surfaces, area lights, several media "
+            "or emission",
             "Set max_depth to 2 or -1",
         )
     if len(parts) < len(description.media.grids):
@@ -66,8 +72,6 @@ def _check_medium(part: CachedMedium, keys: list[str]) -> None:
             f"{name} scatters anisotropically {among}, and there are {len(lamps)} area emitters"
         )
         refuse_all(keys, reason, f"Use {MAX_LAMPS} at most")
-    if medium.emission is not None:
-        refuse_all(keys, f"{name} is emissive {among}", "Remove the emission")
     if medium.refracts:
         refuse_all(keys, f"the boundary of {name} refracts", "Give it a null BSDF")
     if part.shared is not None:
@@ -88,8 +92,8 @@ class TracedAdjoint:
     """Derivatives of objectives of images of ``scene`` with respect to the parameters ``keys``.
 
     The interface is that of `ParameterAdjoint`. ``parts`` are all media of the scene, with their
-    caches; ``step`` and ``hide_emitters`` the integrator's properties; ``seed`` determines random
-    numbers.
+    caches; ``image`` are the integrator's properties ``step``, ``hide_emitters`` and ``emission``;
+    ``seed`` determines random numbers.
     """
 
     #: camera samples of a launch
@@ -101,13 +105,18 @@ class TracedAdjoint:
         params: mi.SceneParameters,
         keys: list[str],
         parts: list[CachedMedium],
-        image: tuple[float, bool],
+        image: tuple[float, bool, object],
         seed: int,
     ) -> None:
         self._scene, self._params, self._parts, self._seed = scene, params, parts, seed
-        self._keys, (self._step, self._hides) = keys, image
+        self._keys, (self._step, self._hides, emission) = keys, image
         media = list(media_of(scene))
-        self._roles = roles_among(params, keys, [media[p.medium.number] for p in parts], scene)
+        own = [media[part.medium.number] for part in parts]
+        self._roles = roles_among(params, keys, own, scene, emission)
+        checks = {MEAN_COSINE: check_mean_cosine, EMISSION: check_emission}
+        for key, role in self._roles.items():
+            if isinstance(role, tuple) and role[1] in checks:
+                checks[role[1]](key, parts[role[0]].medium)
 
     def view(self, film: FilmAdjoint) -> tuple[dict[str, object], list[mi.Float] | None]:
         """Return derivatives and adjoint fluence as `ParameterAdjoint.view`; the fluence of all
@@ -138,7 +147,7 @@ class TracedAdjoint:
         """Refuse forward mode."""
         refuse_all(
             list(changes),
-            "dr.forward was called, and there are surfaces, area lights or several media",
+            "dr.forward was called, and there are surfaces, area lights, several media or emission",
             "Call dr.backward on a loss",
         )
 
@@ -148,6 +157,9 @@ class TracedAdjoint:
         for key, role in self._roles.items():
             if isinstance(role, tuple):
                 number, name = role
+                if name == MEAN_COSINE:
+                    wanted[number][name] = 1
+                    continue
                 field = field_of(original_of(self._parts[number].medium), name)
                 own = field.channels if field.grid is not None else channels_of(self._params[key])
                 wanted[number][name] = max(wanted[number].get(name, 1), own)
@@ -166,19 +178,27 @@ class TracedAdjoint:
         for key, role in self._roles.items():
             if not isinstance(role, tuple):
                 continue  # accumulated in Dr.Jit's graph
-            number, name = role
+            (number, name), value = role, self._params[key]
+            if name == MEAN_COSINE:
+                result[key] = shaped_like(value, found[number][name])
+                continue
             field = field_of(original_of(self._parts[number].medium), name)
-            value = self._params[key]
             result[key] = shaped_like(value, by_parameter(value, field, found[number][name]))
         return result
 
 
 def roles_among(
-    params: mi.SceneParameters, keys: list[str], media: list[mi.Medium], scene: mi.Scene
+    params: mi.SceneParameters,
+    keys: list[str],
+    media: list[mi.Medium],
+    scene: mi.Scene,
+    emission: object = None,
 ) -> dict[str, object]:
     """Return the role of each of the parameters ``keys``, by key.
 
-    A role is the number of one of the ``media`` with `SIGMA_T` or `ALBEDO`; the emitter whose
+    A role is the number of one of the ``media`` with `SIGMA_T`, `ALBEDO` or, if its phase function
+    is ``hg``, `MEAN_COSINE`; 0 and `EMISSION` for the integrator's volume ``emission``; the emitter
+    whose
     radiance the parameter is; the diffuse BSDF whose reflectance it is; or a `SharedTexture`.
 
     Raises IrrcacheError for any other parameter.
@@ -190,11 +210,16 @@ def roles_among(
             if isinstance(nodes.get(node), tuple):
                 refuse(key_of_node(params, keys, node, keys[0]), "several media depend on it")
             nodes[node] = number, role
+    for node in nodes_of_emission(emission):
+        key = key_of_node(params, keys, node, "")
+        if len(media) > 1 and key:
+            refuse(key, "several media depend on it")
+        nodes[node] = 0, EMISSION
     for shape in scene.shapes():
         if shape.bsdf() is not None:
             for node, bsdf in _reflectances(shape.bsdf()).items():
                 add_user(nodes, node, bsdf)
-    roles = {key: role_of(params, key, nodes) for key in keys}
+    roles = {key: _mean_cosine(params, key, media) or role_of(params, key, nodes) for key in keys}
     specular = {
         node: user
         for shape in scene.shapes()
@@ -209,6 +234,16 @@ def roles_among(
         if reflects and not float(np.min(np.array(params[key]))) > 0:
             refuse(key, "it is 0 somewhere, where paths end; start with a small positive value")
     return roles
+
+
+def _mean_cosine(
+    params: mi.SceneParameters, key: str, media: list[mi.Medium]
+) -> tuple[int, str] | None:
+    """Return the role of a parameter that is the mean cosine of one of the ``media``."""
+    own = [number for number, m in enumerate(media) if is_mean_cosine(params, key, m)]
+    if len(own) > 1:
+        refuse(key, "several media depend on it")
+    return (own[0], MEAN_COSINE) if own else None
 
 
 def _reflectances(bsdf: mi.BSDF) -> dict[mi.Object, mi.BSDF]:

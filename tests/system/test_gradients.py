@@ -531,7 +531,6 @@ def test_positions_of_lights_in_the_medium_are_refused(rgb):
         ({"max_depth": 4}, "max_depth is 4"),
         ({"filter": "bilateral"}, "filtered or has aovs"),
         ({"aovs": "z:depth"}, "filtered or has aovs"),
-        ({"emission": 0.1}, "is emissive"),
     ],
 )
 def test_settings_without_gradients_are_refused(rgb, properties, reason):

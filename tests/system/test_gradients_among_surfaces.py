@@ -19,6 +19,7 @@ from experiments.validation.gradients.cases import (
     distant,
     ground,
     lamp,
+    second_medium,
 )
 from experiments.validation.gradients.differences import (
     compare,
@@ -110,6 +111,13 @@ def test_images_in_one_loss_have_paths_of_their_own(mono, monkeypatch):
         pytest.param("hg 0.5, two media, sun", ("sigma_t", "albedo"), marks=pytest.mark.slow),
         pytest.param("hg 0.5, distant object, empty voxels", ("sigma_t",), marks=pytest.mark.slow),
         pytest.param("hg 0.85, ground, sun", ("sigma_t", "albedo"), marks=pytest.mark.slow),
+        ("emission, hg 0.5, sun, single", ("sigma_t", "emission")),
+        pytest.param("emission alone", ("sigma_t", "albedo", "emission"), marks=pytest.mark.slow),
+        pytest.param("emission, ground, sky", ("sigma_t", "emission"), marks=pytest.mark.slow),
+        pytest.param("hg 0.54, ground, sky", ("g",), marks=pytest.mark.slow),
+        pytest.param("hg -0.45, room, sky", ("g",), marks=pytest.mark.slow),
+        ("hg 0.54, ground, sun, single", ("g",)),
+        pytest.param("hg 0.65, two media, sun", ("g",), marks=pytest.mark.slow),
     ],
 )
 def test_gradients_are_those_of_the_image(mono, name, parameters):
@@ -412,6 +420,28 @@ def test_many_lamps_around_anisotropic_media_are_refused(rgb, monkeypatch):
     monkeypatch.setattr(traced, "MAX_LAMPS", 0)
     case = replace(SMALL, emitters=dict, objects=lamp, g=0.3)
     assert "1 area emitters" in refused(case, "sigma_t.data")
+
+
+def test_emission_of_several_media_is_refused(mono):
+    """The integrator's volume of emission belongs to all media."""
+    case = Case(data=6, cache=6, emissive=True, objects=lambda: second_medium(0.5))
+    assert "several media depend on it" in refused(case, "emission.data")
+
+
+def test_emission_of_zero_is_refused(mono):
+    scene = Case(data=6, cache=6, emissive=True, objects=ground).load()
+    params = mi.traverse(scene)
+    key = first_key(params, "emission")
+    params[key] = mi.TensorXf(np.zeros_like(np.array(params[key])))
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(IrrcacheError, match="the emission is 0 everywhere"):
+        dr.backward(dr.mean(mi.render(scene, params, spp=1)))
+
+
+def test_a_mean_cosine_of_zero_is_refused(mono):
+    case = Case(data=6, cache=6, g=0.0, objects=ground)
+    assert "it is 0, where scattering is isotropic" in refused(case, "phase_function.g")
 
 
 def test_forward_mode_is_refused(rgb, fewer_paths):

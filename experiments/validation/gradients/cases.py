@@ -311,7 +311,7 @@ def surrounded() -> dict[str, Case]:
     part: it has many directions, and perturbations are larger.
     """
     colour = {"type": "rgb", "value": [0.6, 0.5, 0.4]}
-    both = ("sigma_t", "albedo")
+    both, by_g = ("sigma_t", "albedo"), {"parameters": ("g",)}
     found = {
         "ground, sky": Case(objects=ground, parameters=(*both, "floor")),
         "ground, sky, 32^3": Case(cache=32, objects=ground),
@@ -374,6 +374,30 @@ def surrounded() -> dict[str, Case]:
             objects=distant,
             emitters=_under(sun=SUN),
             parameters=("sigma_t",),
+        ),
+        "emission alone": Case(emissive=True, emitters=dict, parameters=(*both, "emission")),
+        "emission, ground, sky": Case(
+            emissive=True, objects=ground, parameters=(*both, "emission", "floor")
+        ),
+        "emission, hg 0.5, sun, single": Case(
+            emissive=True,
+            g=0.5,
+            emitters=_under(sun=SUN),
+            max_depth=2,
+            parameters=(*both, "emission"),
+        ),
+        "hg 0.54, ground, sky": Case(g=0.54, objects=ground, **by_g),
+        "hg 0.54, ground, sun, single": Case(
+            g=0.54, emitters=_under(sun=SUN), objects=ground, max_depth=2, **by_g
+        ),
+        "hg 0.54, lamp over a ground": Case(
+            g=0.54, emitters=dict, objects=lambda: ground() | lamp(), **by_g
+        ),
+        "hg -0.45, room, sky": Case(g=-0.45, objects=room, **by_g),
+        "hg 0.82, ground, sun": Case(g=0.823, emitters=_under(sun=SUN), objects=ground, **by_g),
+        "hg 0.82, ground, sky": Case(g=0.823, objects=ground, **by_g),
+        "hg 0.65, two media, sun": Case(
+            g=0.65, emitters=_under(sun=SUN), objects=lambda: second_medium(0.5, g=-0.4), **by_g
         ),
         "hg 0.85, ground, sky": Case(g=0.85, objects=ground),
         "hg 0.85, ground, sun": Case(g=0.85, emitters=_under(sun=SUN), objects=ground),

@@ -13,8 +13,8 @@ from mitsuba_irrcache.compare.gradients import gradients_of
 
 #: Camera samples of each pixel for gradients, if nothing else is said.
 SPP_GRAD = 64
-#: Perturbations of a grid, their width in edges of it, and the largest change of an albedo or of
-#: emission, relative to 1 or to the maximum.
+#: Perturbations of a grid, their width in edges of it, and the largest change of an albedo; of
+#: emission, it is ten times as much of the maximum.
 BLOBS, WIDTH, STEP = 6, 0.12, 0.03
 
 
@@ -124,7 +124,8 @@ def directions(case: Case, name: str, value: np.ndarray, count: int) -> list[np.
         colour = rng.uniform(0.3, 1.0, value.shape[-1])
         peak = case.depth * case.data / EDGE
         steps = {"sigma_t": case.step * peak, "albedo": STEP}
-        step = steps.get(name, STEP * value.max())
+        # Images depend linearly on emission, and change little with it.
+        step = steps.get(name, 10 * STEP * value.max())
         found.append(step * plane * colour / colour.max())
     return found
 

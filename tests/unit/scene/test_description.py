@@ -224,5 +224,5 @@ def test_emitters_that_mitsuba_samples_as_black_are_refused(scenes, tmp_path):
         box=scenes.boundary(scenes.medium(1.0, 0.5), scenes.placement()),
         lamp=lamp,
     )
-    with pytest.raises(UnsupportedSceneError, match='"lamp".*"mesh_attribute"'):
+    with pytest.raises(UnsupportedSceneError, match=r'"lamp".*"mesh_attribute"'):
         compile_scene(scene)
