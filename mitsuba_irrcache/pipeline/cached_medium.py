@@ -29,7 +29,7 @@ from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.io.files import check_folder_of
-from mitsuba_irrcache.lights.emitters import EmitterKind, position_of
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, position_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.lights.narrow_sources import MAX_LAMPS, sources_of
 from mitsuba_irrcache.machine.memory import release_unused_memory, require_memory
@@ -37,6 +37,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache
 from mitsuba_irrcache.scene.consistency import camera_rays
 from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.scene.fine_shadows import warn_of_fine_shadows
 from mitsuba_irrcache.scene.fingerprint import differing, digests
 from mitsuba_irrcache.scene.media_shares import why_shared
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
@@ -54,6 +55,8 @@ from mitsuba_irrcache.solvers.grid_size import (
 )
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 
+#: Optical depth of a medium along its longest side above which shadows in it are notable.
+SMALL_DEPTH = 0.15
 #: Relative variance of voxels above which a warning is logged: images around a flame that few
 #: directions meet are 2 to 4 % too dark with 0.2, and 40 % with 0.7.
 LARGE_VARIANCE = 0.15
@@ -295,6 +298,10 @@ class CachedMedium:
             if not warn_of_opaque_voxels(medium, grid, settings.max_depth):
                 warn_of_unresolved_detail(medium, grid)
             warn_of_unresolved_objects(medium, grid)
+            depth = mean_extinction(medium) * np.linalg.norm(medium.frame[:3, :3], axis=0).max()
+            if not medium.is_isolated and depth > SMALL_DEPTH:
+                sharp = self.description.emitters.of(EmitterKind.SUN, *POINT_LIKE)
+                warn_of_fine_shadows(scene, grid, list(sharp), f'medium "{medium.name}"')
         whole = np.zeros(3, int), grid.resolution
         self.shared = None if medium.is_isolated else why_shared(scene, medium, grid, whole)
         active, classes = self._active_voxels(scene, grid)

@@ -350,7 +350,7 @@ class TracedCameraRays:
                 on_emitter = sampler.emitter_sample()
             else:
                 on_emitter = EmitterSample(sampler.next_2d(traced))
-            direct, reflected, interacted, *_ = self._surfaces.paths.follow(
+            direct, reflected, straight, *_ = self._surfaces.paths.follow(
                 scene, end, pointer, rng, traced, on_emitter, self.hide_emitters, marched.near
             )
         else:
@@ -360,7 +360,8 @@ class TracedCameraRays:
             is_cached = self._is_cached if self._ends_in_media else None
             paths = PathTracer(scene, self.media, *depths, self.hide_emitters, is_cached)
             sums, _ = paths.trace(start, rng, traced)
-            direct, reflected, interacted = sums.direct, sums.scattered, sums.interacted
+            direct, reflected = sums.direct, sums.scattered
+            straight = dr.select(sums.interacted, 0, mi.Spectrum(1))
             if self._ends_in_media:
                 reflected += sums.end.weight * self._irradiance(sums.end) * dr.inv_four_pi
         direct_weight = weight
@@ -373,7 +374,7 @@ class TracedCameraRays:
             passed = weight
             if self.narrow is not None:
                 passed, transmittance = dr.select(traced, unscattered / chance, 0), unscattered
-            transparency = dr.select(traced & ~interacted, passed, 0)
+            transparency = dr.select(traced, passed * straight, 0)
             transparency = dr.select(marched.escaped, transmittance, transparency)
             alpha = 1 - dr.sum(transparency) / dr.size_v(mi.Spectrum)
         return RayResult(marched.scattered, background, transmittance, alpha, marched.gathered)

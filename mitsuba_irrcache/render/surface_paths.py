@@ -158,9 +158,9 @@ class SurfacePaths:
         ``on_emitter`` for the first vertex are given, at a camera ray's end before a surface, which
         has ``travelled`` this distance from the camera.
 
-        Returns the radiance of emitters at the first surface, all other radiance, whether there was
-        any interaction, and the node whose irradiance has to be added with the returned factor
-        (only for rays from nodes; else it is included).
+        Returns the radiance of emitters at the first surface, all other radiance, the transmittance
+        of paths without any vertex (0 for others), and the node whose irradiance has to be added
+        with the returned factor (only for rays from nodes; else it is included).
         """
         follower = _PathFollower(self, scene, on_emitter, hide_emitters)
         path, sums = follower.begin(ray, pointer, rng, active)
@@ -168,7 +168,8 @@ class SurfacePaths:
             path.travelled = mi.Float(travelled)
         while dr.hint(path.active, label="surface paths"):
             follower.advance(path, sums)
-        return sums.emitted, sums.radiance, sums.interacted, sums.end_number, sums.end_factor
+        passed = dr.select(sums.interacted, 0, sums.passed)
+        return sums.emitted, sums.radiance, passed, sums.end_number, sums.end_factor
 
     @symbolic
     def direct(self, scene, si, pointer, sample, rng, active, where, exact: bool):
@@ -421,6 +422,8 @@ class _PathSums:
     emitted: mi.Spectrum
     radiance: mi.Spectrum
     interacted: mi.Bool
+    #: transmittance of the media before the first vertex, without that of a forward peak
+    passed: mi.Spectrum
     end_number: mi.UInt32
     end_factor: mi.Spectrum
 
@@ -465,7 +468,8 @@ class _PathFollower:
             active=mi.Bool(active),
         )
         black, none = mi.Spectrum(0), mi.UInt32(0)
-        return path, _PathSums(black, mi.Spectrum(0), mi.Bool(False), none, mi.Spectrum(0))
+        passed = mi.Spectrum(1)
+        return path, _PathSums(black, mi.Spectrum(0), mi.Bool(False), passed, none, mi.Spectrum(0))
 
     def advance(self, path: _FollowedPath, sums: _PathSums) -> None:
         """Trace paths to their next surface, and sample the direction in which they continue."""
@@ -512,10 +516,12 @@ class _PathFollower:
             )
             sums.radiance += dr.select(hit, path.throughput * (scattered + emitted), 0)
             path.throughput = dr.select(hit, path.throughput * transmittance, path.throughput)
+            unscattered = transmittance
             if projection.truncates_peak:
                 unscattered = projection.unscattered(transmittance, path.ray, entry, leave, hit)
                 share = dr.minimum(unscattered / dr.maximum(transmittance, 1e-30), 1)
                 path.share *= dr.select(hit & (entry < leave), share, 1)
+            sums.passed *= dr.select(hit & path.first & (entry < leave), unscattered, 1)
         path.clear = mi.Bool(False)
 
     def _add_hit_emitter(

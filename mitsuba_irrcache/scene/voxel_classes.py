@@ -16,10 +16,20 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.scene.occluders import first_surface, hole_in
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, refracts, transmits
+from mitsuba_irrcache.transport.path import (
+    MOST_CROSSINGS,
+    Media,
+    is_null,
+    position_on,
+    refracts,
+    transmits,
+    visibility,
+    with_valid_direction,
+)
 
-#: Number of rays from each voxel that determine its medium.
-RAYS = 16
+#: Number of rays from each voxel that determine its medium; number of samples of emitters that
+#: determine whether it is directly illuminated.
+RAYS, EMITTER_SAMPLES = 16, 8
 
 
 class VoxelClasses(Immutable):
@@ -31,7 +41,8 @@ class VoxelClasses(Immutable):
             first of ``media``, and so on (see `Media.pointer_of`).
         readable: mask of the voxels that a lookup in ``medium`` can read: voxels that overlap the
             medium, and their neighbours.
-        enclosed: mask of the voxels from whose centres only backs of surfaces are visible.
+        enclosed: mask of the voxels that lie within objects: from their centres only backs of
+            surfaces are visible, and surfaces separate them from all that emitters illuminate.
         cut_cells: cells between voxel centres that surfaces intersect; None without any.
         separated: for x, y, z, a mask of the voxels that a surface separates from the next voxel
             along this axis; None if there are no cut cells.
@@ -57,8 +68,8 @@ class VoxelClasses(Immutable):
         exact = exact and hole_in(scene, medium, grid, box) is None
         glass = any(refracts(shape) for shape in scene.shapes())
         *votes, within, backs = _probed(scene, media, medium, grid, index, exact, glass)
-        within, enclosed = within > 0, backs == RAYS
-        dr.eval(votes, within, enclosed)
+        within, sees_backs = within > 0, backs == RAYS
+        dr.eval(votes, within, sees_backs)
         best, number = mi.UInt32(0), mi.UInt32(0)
         for i, count in enumerate(votes):
             number = dr.select(count > best, i, number)
@@ -69,11 +80,16 @@ class VoxelClasses(Immutable):
             self.inside = number == medium.number + 1
             dr.eval(self.inside)
         cut_cells = CutCells(scene, grid, None if self.inside is None else medium.pointer)
-        self.medium_number, self.enclosed = number, enclosed
+        self.medium_number = number
         self.cut_cells = cut_cells if cut_cells.count else None
         self.separated = None
         if cut_cells.count:
             self.separated = tuple(_separated(scene, grid, axis) for axis in range(3))
+        # Walls of a room may have normals that point outwards.
+        self.enclosed = sees_backs
+        if dr.any(sees_backs):
+            self.enclosed &= _unreached(scene, grid, self.separated)
+            dr.eval(self.enclosed)
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
         self.readable = within | (total > 0)
         if self.inside is not None:
@@ -188,6 +204,53 @@ def _separated(scene: mi.Scene, grid: Grid, axis: int) -> mi.Bool:
     stop = grid.world.point(mi.Point3f(*at) + 0.5)
     *_, found = first_surface(scene, start, stop, exists)
     dr.eval(found)
+    return found
+
+
+def _unreached(
+    scene: mi.Scene, grid: Grid, separated: tuple[mi.Bool, mi.Bool, mi.Bool] | None
+) -> mi.Bool:
+    """Return for each voxel whether surfaces separate it from all that emitters illuminate; false
+    everywhere if they illuminate no voxel directly.
+    """
+    count, index = dr.opaque(mi.UInt32, EMITTER_SAMPLES), dr.arange(mi.UInt32, grid.voxel_count)
+    reached = _is_illuminated(scene, grid.centers(index), count)
+    dr.eval(reached)
+    if separated is None or not dr.any(reached):
+        return dr.full(mi.Bool, False, grid.voxel_count)
+    before = 0
+    while (after := dr.count(reached)[0]) > before:
+        before = after
+        for axis, barrier in enumerate(separated):
+            for step in (1, -1):
+                offset = [step * (k == axis) for k in range(3)]
+                other, exists = _neighbour(grid, index, offset)
+                # A barrier lies between a voxel and the next one.
+                lower = index if step > 0 else other
+                exists &= ~dr.gather(mi.Bool, barrier, lower, exists)
+                reached |= dr.gather(mi.Bool, reached, other, exists)
+                dr.eval(reached)
+    return ~reached
+
+
+@symbolic
+def _is_illuminated(scene: mi.Scene, p: mi.Point3f, samples: mi.UInt32):
+    """Return whether any of the ``samples`` of emitters is visible from positions, or through
+    surfaces that let light pass straight.
+    """
+    vertex = dr.zeros(mi.Interaction3f, dr.width(p))
+    vertex.p = p
+    none, rng = dr.zeros(mi.MediumPtr, dr.width(p)), mi.PCG32(dr.width(p))
+    k, found = mi.UInt32(0), mi.Bool(False)
+    while dr.hint(k < samples, label="illuminated voxels"):
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        record, value = scene.sample_emitter_direction(vertex, u, False, ~found)
+        sampled = ~found & (record.pdf > 0) & (dr.max(value) > 0)
+        record = with_valid_direction(record)
+        target = position_on(record, vertex)
+        passed, rng = visibility(scene, Media([]), vertex, target, none, rng, sampled, exact=True)
+        found |= sampled & (dr.max(passed) > 0)
+        k += 1
     return found
 
 

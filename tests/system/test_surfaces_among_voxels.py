@@ -63,6 +63,30 @@ def test_a_furnace_has_radiance_one(scenes, size):
     assert values[body].mean() < 0.02
 
 
+@pytest.mark.parametrize("kind", ["cube", "sphere"])
+def test_walls_may_have_normals_outwards(scenes, kind):
+    """Voxels in a room from which only backs of walls are visible counted as the inside of an
+    object, and scattered nothing: images lost 9 to 65 % of their mean without a message.
+    """
+    means = []
+    for normals in ({}, {"flip_normals": True}):
+        two_sided = {"type": "twosided", "bsdf": diffuse(0.7, 0.7, 0.7)}
+        walls = {"type": kind, "to_world": mi.ScalarTransform4f().scale(1.02), "bsdf": two_sided}
+        objects = {
+            "box": bound(kind, fog((0.8,) * 3)),
+            "walls": walls | normals,
+            "lamp": lamp((0, 0.7, 0), (0, 0, 0.001), 0.3),
+            "ball": ball((0.3, -0.4, 0.1)) | {"bsdf": two_sided},
+            "emitter": None,
+            "sun": None,
+        }
+        _, cache = rendered(scenes, objects, cache_spp=64)
+        enclosed = np.array(cache.voxel_classes.enclosed).sum() / VOXELS**3 * 8
+        assert enclosed == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=0.2)  # the ball
+        means.append(np.array(cache.irradiance).mean())
+    assert means[0] == pytest.approx(means[1], rel=0.005)
+
+
 def test_luminous_walls_have_little_noise(scenes):
     """Where paths end at cached irradiance, emitters close by are found by two strategies: with
     samples of the emitters alone the standard deviation is 7 %, and the median 2 % too small.
