@@ -116,8 +116,8 @@ def test_images_in_one_loss_have_paths_of_their_own(mono, monkeypatch):
         pytest.param("emission, ground, sky", ("sigma_t", "emission"), marks=pytest.mark.slow),
         pytest.param("hg 0.54, ground, sky", ("g",), marks=pytest.mark.slow),
         pytest.param("hg -0.45, room, sky", ("g",), marks=pytest.mark.slow),
-        ("hg 0.54, ground, sun, single", ("g",)),
-        pytest.param("hg 0.65, two media, sun", ("g",), marks=pytest.mark.slow),
+        pytest.param("hg 0.54, ground, sun, single", ("g",), marks=pytest.mark.slow),
+        ("hg 0.65, two media, sun", ("g",)),
     ],
 )
 def test_gradients_are_those_of_the_image(mono, name, parameters):
