@@ -29,7 +29,7 @@ from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.io.files import check_folder_of
-from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, position_of
+from mitsuba_irrcache.lights.emitters import EmitterKind, position_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.lights.narrow_sources import MAX_LAMPS, sources_of
 from mitsuba_irrcache.machine.memory import release_unused_memory, require_memory
@@ -300,8 +300,8 @@ class CachedMedium:
             warn_of_unresolved_objects(medium, grid)
             depth = mean_extinction(medium) * np.linalg.norm(medium.frame[:3, :3], axis=0).max()
             if not medium.is_isolated and depth > SMALL_DEPTH:
-                sharp = self.description.emitters.of(EmitterKind.SUN, *POINT_LIKE)
-                warn_of_fine_shadows(scene, grid, list(sharp), f'medium "{medium.name}"')
+                name = f'medium "{medium.name}"'
+                warn_of_fine_shadows(scene, grid, self.description.emitters, name)
         whole = np.zeros(3, int), grid.resolution
         self.shared = None if medium.is_isolated else why_shared(scene, medium, grid, whole)
         active, classes = self._active_voxels(scene, grid)

@@ -478,8 +478,8 @@ class _PathFollower:
         self._march_media(path, sums, si)
         valid = path.active & si.is_valid()
         path.travelled += dr.select(valid, si.t, 0)
-        self._add_hit_emitter(path, sums, si, valid)
-        crosses = valid & is_null(si.bsdf().flags())
+        hidden = self._add_hit_emitter(path, sums, si, valid)
+        crosses = valid & (is_null(si.bsdf().flags()) | hidden)
         surface = valid & ~crosses
         ends = self._end_at_nodes(path, sums, si, surface)
         self._add_sampled_emitters(path, sums, si, surface, ends)
@@ -530,11 +530,17 @@ class _PathFollower:
         sums: _PathSums,
         si: mi.SurfaceInteraction3f,
         valid: mi.Bool,
-    ) -> None:
-        """Add emission, with multiple importance sampling where the last vertex sampled it."""
+    ) -> mi.Bool:
+        """Add emission, with multiple importance sampling where the last vertex sampled it.
+
+        Returns the mask of lanes whose surface is a hidden emitter, which the path passes through.
+        """
         paths, emitter = self._paths, si.emitter(self._scene, path.active)
         is_emitter = path.active & (emitter != None)  # noqa: E711
+        hidden = mi.Bool(False)
         if self._hide_emitters:
+            # As in volpath, hidden emitters are transparent if they are outside of all media.
+            hidden = is_emitter & path.first & (path.pointer == None)  # noqa: E711
             is_emitter &= ~path.first
         value = emitter.eval(si, is_emitter)
         excess = paths.emitters.excess(emitter, value)
@@ -554,6 +560,7 @@ class _PathFollower:
         value = dr.select(is_emitter, value * (1 - excess + excess * weight), 0)
         sums.emitted += dr.select(path.first, value, 0)
         sums.radiance += dr.select(path.first, 0, value)
+        return hidden
 
     def _end_at_nodes(
         self,

@@ -13,7 +13,14 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.consistency import described
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, flags_of, is_null, is_solid, is_surface
+from mitsuba_irrcache.transport.path import (
+    MOST_CROSSINGS,
+    flags_of,
+    is_null,
+    is_solid,
+    is_surface,
+    transmits,
+)
 
 #: Offsets of the rays along each axis that detect surfaces: through the corners and the centre of
 #: each voxel's face.
@@ -146,8 +153,11 @@ def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
 
 
 @symbolic
-def first_surface(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f, active: mi.Bool):
-    """Find the first surface between ``start`` and ``stop`` that is not a null boundary.
+def first_surface(
+    scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f, active: mi.Bool, opaque: bool = False
+):
+    """Find the first surface between ``start`` and ``stop`` that is not a null boundary; if
+    ``opaque``, the first one that transmits nothing.
 
     Returns its distance from ``start`` (0 without one), its normal, and whether there is one.
     """
@@ -160,6 +170,8 @@ def first_surface(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f, active: 
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         solid = active & is_solid(si)
+        if dr.hint(opaque, mode="scalar"):
+            solid &= ~transmits(si.bsdf().flags())
         crossed = dr.norm(si.p - start)
         distance = dr.select(solid, crossed, distance)
         normal = dr.select(solid, si.n, normal)

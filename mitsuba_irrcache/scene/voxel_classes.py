@@ -88,7 +88,7 @@ class VoxelClasses(Immutable):
         # Walls of a room may have normals that point outwards.
         self.enclosed = sees_backs
         if dr.any(sees_backs):
-            self.enclosed &= _unreached(scene, grid, self.separated)
+            self.enclosed &= _unreached(scene, grid)
             dr.eval(self.enclosed)
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
         self.readable = within | (total > 0)
@@ -192,9 +192,9 @@ def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f, is_mediu
     return back
 
 
-def _separated(scene: mi.Scene, grid: Grid, axis: int) -> mi.Bool:
-    """Return for each voxel whether a surface lies between its centre and that of the next voxel
-    along ``axis``; false for the last voxels.
+def _separated(scene: mi.Scene, grid: Grid, axis: int, opaque: bool = False) -> mi.Bool:
+    """Return for each voxel whether a surface, if ``opaque`` one that transmits nothing, lies
+    between its centre and that of the next voxel along ``axis``; false for the last voxels.
     """
     index = dr.arange(mi.UInt32, grid.voxel_count)
     at = list(grid.voxel_indices(index))
@@ -202,26 +202,25 @@ def _separated(scene: mi.Scene, grid: Grid, axis: int) -> mi.Bool:
     exists = at[axis] + 1 < mi.UInt32(grid.sides[axis])
     at[axis] = at[axis] + 1
     stop = grid.world.point(mi.Point3f(*at) + 0.5)
-    *_, found = first_surface(scene, start, stop, exists)
+    *_, found = first_surface(scene, start, stop, exists, opaque)
     dr.eval(found)
     return found
 
 
-def _unreached(
-    scene: mi.Scene, grid: Grid, separated: tuple[mi.Bool, mi.Bool, mi.Bool] | None
-) -> mi.Bool:
-    """Return for each voxel whether surfaces separate it from all that emitters illuminate; false
-    everywhere if they illuminate no voxel directly.
+def _unreached(scene: mi.Scene, grid: Grid) -> mi.Bool:
+    """Return for each voxel whether surfaces that transmit nothing separate it from all voxels that
+    emitters illuminate; false everywhere if they illuminate no voxel directly.
     """
     count, index = dr.opaque(mi.UInt32, EMITTER_SAMPLES), dr.arange(mi.UInt32, grid.voxel_count)
     reached = _is_illuminated(scene, grid.centers(index), count)
     dr.eval(reached)
-    if separated is None or not dr.any(reached):
+    if not dr.any(reached):
         return dr.full(mi.Bool, False, grid.voxel_count)
+    barriers = [_separated(scene, grid, axis, opaque=True) for axis in range(3)]
     before = 0
     while (after := dr.count(reached)[0]) > before:
         before = after
-        for axis, barrier in enumerate(separated):
+        for axis, barrier in enumerate(barriers):
             for step in (1, -1):
                 offset = [step * (k == axis) for k in range(3)]
                 other, exists = _neighbour(grid, index, offset)

@@ -244,13 +244,14 @@ def test_hidden_emitters_and_alpha(scenes, hide):
 @pytest.mark.parametrize("max_depth", [-1, 3])
 def test_alpha_behind_a_mask(scenes, max_depth):
     """Fog behind a partly transparent card is not transparent: with all orders alpha was that of
-    the card alone.
+    the card alone. A hidden lamp between them is, but its shape was opaque.
     """
     sensor = scenes.description({}, None, SIZE)["sensor"]
     sensor["film"] = sensor["film"] | {"pixel_format": "rgba"}
     mask = {"type": "mask", "opacity": 0.4, "nested": diffuse(0.5, 0.5, 0.5)}
     card = {"type": "rectangle", "to_world": placed((0.3, 0.5, -1.7), (2, 2, 1)), "bsdf": mask}
     objects = {"box": bound(interior=fog()), "sensor": sensor, "sun": None, "card": card}
+    objects["behind"] = lamp((0.3, 0.5, -1.4), (1.0, 1.5, -5.0), 0.3, (1, 2, 3))
     depth = {"max_depth": max_depth, "rr_depth": 1000, "hide_emitters": True}
     found = images(scenes, objects, {"resolution": 8, "cache_spp": 16}, depth, (64, 128))
     check(*(i[..., 3:] for i in found))

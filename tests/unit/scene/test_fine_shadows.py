@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import EmittersByKind
 from mitsuba_irrcache.scene.fine_shadows import share_of_edges, warn_of_fine_shadows
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -56,12 +57,32 @@ def test_boundaries_and_lack_of_light_have_no_edges():
         assert share_of_edges(loaded, Grid((8,) * 3, CUBE), loaded.emitters()[0]) == 0
 
 
-@pytest.mark.parametrize("emitter", [DOWN, {"type": "point", "position": [0, 40, 0]}])
-@pytest.mark.parametrize(("period", "warned"), [(0.2, True), (1.3, False)])
+def lamp(size: float) -> dict:
+    place = mi.ScalarTransform4f().translate([0, 4, 0]).rotate([1, 0, 0], 90).scale(size)
+    return {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
+
+
+POINT = {"type": "point", "position": [0, 40, 0]}
+
+
+@pytest.mark.parametrize(
+    ("emitter", "period", "warned"),
+    [
+        (lambda: DOWN, 0.2, True),
+        (lambda: DOWN, 1.3, False),
+        (lambda: POINT, 0.2, True),
+        (lambda: POINT, 1.3, False),
+        (lambda: lamp(0.02), 0.2, True),
+        (lambda: lamp(2), 0.2, False),
+    ],
+)
 def test_fine_shadows_are_noted(logged, emitter, period, warned):
-    """Beams between slats were wrong by 20 % in blocks of pixels, without a message."""
-    loaded = scene(blinds(period), emitter)
-    warn_of_fine_shadows(loaded, Grid((32,) * 3, CUBE), loaded.emitters(), 'medium "fog"')
+    """Beams between slats were wrong by 20 % in blocks of pixels, without a message. Those of wide
+    lamps are not sharp.
+    """
+    loaded = scene(blinds(period), emitter())
+    emitters = EmittersByKind(loaded.emitters())
+    warn_of_fine_shadows(loaded, Grid((32,) * 3, CUBE), emitters, 'medium "fog"')
     assert len(logged) == warned
     if warned:
         assert 'medium "fog"' in logged[0] and "Raise resolution (now 32)" in logged[0]
