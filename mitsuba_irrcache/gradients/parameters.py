@@ -175,7 +175,7 @@ def refuse(key: str, reason: str) -> None:
     """Raise IrrcacheError for a parameter with respect to which no gradient is computed."""
     raise IrrcacheError(
         f'irrcache computes no gradient of the parameter "{key}": {reason}. It has gradients of '
-        "sigma_t, albedo and g of hg of a medium, of the emission of a single one, and of radiance; "
+        "sigma_t, albedo and g of hg of a medium, of emission of a single one, and of radiance; "
         "among surfaces of diffuse reflectance; in isotropic media without surfaces of positions "
         "of points and directions of suns; detach this "
         'parameter (dr.disable_grad, params.update), or use the integrator "prbvolpath".'
