@@ -10,7 +10,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import kronecker
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, EmittersByKind
-from mitsuba_irrcache.transport.path import Media, position_on, visibility, with_valid_direction
+from mitsuba_irrcache.transport.path import illuminates
 
 #: Number of pairs of positions one voxel apart, and the smallest number of them that an emitter
 #: must illuminate; number of tested points on an area emitter, and of such emitters.
@@ -67,14 +67,10 @@ def _visible_part(scene: mi.Scene, emitter: mi.EmitterPtr, p: mi.Point3f, points
     """
     vertex = dr.zeros(mi.Interaction3f, dr.width(p))
     vertex.p = p
-    none, rng = dr.zeros(mi.MediumPtr, dr.width(p)), mi.PCG32()
-    k, found = mi.UInt32(0), mi.Float(0)
+    k, found, rng = mi.UInt32(0), mi.Float(0), mi.PCG32()
     while dr.hint(k < points, label="fine shadows"):
         record, value = emitter.sample_direction(vertex, mi.Point2f(kronecker(k, 2)), mi.Bool(True))
-        sampled = (record.pdf > 0) & (dr.max(value) > 0)
-        record = with_valid_direction(record)
-        target = position_on(record, vertex)
-        passed, rng = visibility(scene, Media([]), vertex, target, none, rng, sampled, exact=True)
-        found += dr.select(sampled & (dr.max(passed) > 0), mi.Float(1), 0)
+        seen, rng = illuminates(scene, vertex, record, value, rng, mi.Bool(True))
+        found += dr.select(seen, mi.Float(1), 0)
         k += 1
     return found / mi.Float(points)

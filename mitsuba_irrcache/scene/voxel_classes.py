@@ -19,12 +19,10 @@ from mitsuba_irrcache.scene.occluders import first_surface, hole_in
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     Media,
+    illuminates,
     is_null,
-    position_on,
     refracts,
     transmits,
-    visibility,
-    with_valid_direction,
 )
 
 #: Number of rays from each voxel that determine its medium; number of samples of emitters that
@@ -239,16 +237,12 @@ def _is_illuminated(scene: mi.Scene, p: mi.Point3f, samples: mi.UInt32):
     """
     vertex = dr.zeros(mi.Interaction3f, dr.width(p))
     vertex.p = p
-    none, rng = dr.zeros(mi.MediumPtr, dr.width(p)), mi.PCG32(dr.width(p))
-    k, found = mi.UInt32(0), mi.Bool(False)
+    k, found, rng = mi.UInt32(0), mi.Bool(False), mi.PCG32(dr.width(p))
     while dr.hint(k < samples, label="illuminated voxels"):
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         record, value = scene.sample_emitter_direction(vertex, u, False, ~found)
-        sampled = ~found & (record.pdf > 0) & (dr.max(value) > 0)
-        record = with_valid_direction(record)
-        target = position_on(record, vertex)
-        passed, rng = visibility(scene, Media([]), vertex, target, none, rng, sampled, exact=True)
-        found |= sampled & (dr.max(passed) > 0)
+        seen, rng = illuminates(scene, vertex, record, value, rng, ~found)
+        found |= seen
         k += 1
     return found
 

@@ -307,6 +307,24 @@ def with_valid_direction(record: mi.DirectionSample3f) -> mi.DirectionSample3f:
     return record
 
 
+def illuminates(
+    scene: mi.Scene,
+    vertex: mi.Interaction3f,
+    record: mi.DirectionSample3f,
+    radiance: mi.Spectrum,
+    rng: mi.PCG32,
+    active: mi.Bool,
+) -> tuple[mi.Bool, mi.PCG32]:
+    """Return whether a sample of an emitter has ``radiance`` that no surface blocks on the way to
+    ``vertex``, and the random number generator. Surfaces that let light pass straight do not block.
+    """
+    sampled = active & (record.pdf > 0) & (dr.max(radiance) > 0)
+    target = position_on(with_valid_direction(record), vertex)
+    none = dr.zeros(mi.MediumPtr, dr.width(vertex.p))
+    passed, rng = visibility(scene, Media([]), vertex, target, none, rng, sampled, exact=True)
+    return sampled & (dr.max(passed) > 0), rng
+
+
 def sample_emitter(
     scene: mi.Scene,
     media: Media,
