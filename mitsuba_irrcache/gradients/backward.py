@@ -14,13 +14,11 @@ from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
 from mitsuba_irrcache.gradients.film import LANES, FilmAdjoint
 from mitsuba_irrcache.gradients.medium import MediumAdjoint, field_of, original_of
 from mitsuba_irrcache.gradients.parameters import (
-    EMISSION,
     MEAN_COSINE,
     Placement,
     by_parameter,
     channels_of,
-    check_emission,
-    check_mean_cosine,
+    check_role,
     nodes_of_emission,
     refuse,
     refuse_all,
@@ -142,14 +140,10 @@ class ParameterAdjoint:
         self._keys, self._roles = keys, roles
         self._of_medium = {k: role for k, role in roles.items() if isinstance(role, str)}
         for key, role in self._of_medium.items():
-            if role == MEAN_COSINE:
-                check_mean_cosine(key, part.medium)
+            check_role(key, role, part.medium)
         self._placed = {k: role for k, role in roles.items() if isinstance(role, Placement)}
         if part.cache is not None:
             check_placements(self._placed, part.cache.grid)
-        for key, role in self._of_medium.items():
-            if role == EMISSION:
-                check_emission(key, part.medium)
         emitters = [role for role in roles.values() if isinstance(role, mi.Emitter)]
         self._emitters = EmitterAdjoint(scene, emitters)
 

@@ -92,15 +92,13 @@ def is_mean_cosine(params: mi.SceneParameters, key: str, medium: mi.Medium) -> b
     return node == medium.phase_function() and node.class_name() == "HGPhaseFunction"
 
 
-def check_mean_cosine(key: str, medium: MediumGrid) -> None:
-    """Refuse derivatives by a mean cosine of 0, for which the cache has no moments."""
-    if medium.phase.is_isotropic:
+def check_role(key: str, role: str, medium: MediumGrid) -> None:
+    """Refuse derivatives by a mean cosine of 0, for which the cache has no moments, and by an
+    emission of 0 everywhere, which is ignored.
+    """
+    if role == MEAN_COSINE and medium.phase.is_isotropic:
         refuse(key, "it is 0, where scattering is isotropic; start with 0.01 or -0.01")
-
-
-def check_emission(key: str, medium: MediumGrid) -> None:
-    """Refuse derivatives by an emission of 0 everywhere, which is ignored."""
-    if medium.emission is None:
+    if role == EMISSION and medium.emission is None:
         reason = "the emission is 0 everywhere, and ignored"
         refuse_all([key], reason, "Start with a small positive value")
 

@@ -211,9 +211,7 @@ class CameraReplay:
         return mi.Spectrum(self.medium.albedo.at_world(p, active))
 
     def emitted(self, p: mi.Point3f, length: mi.Float, active: mi.Bool) -> mi.Spectrum:
-        """Return the radiance that is emitted along a step of this ``length`` around ``p``."""
-        if self.medium.emission is None:
-            return mi.Spectrum(0)
+        """Return the radiance that an emissive medium emits along a step around ``p``."""
         return mi.Spectrum(self.medium.emission.at_world(p, active)) * length
 
     def view(self, direction: mi.Vector3f) -> tuple:

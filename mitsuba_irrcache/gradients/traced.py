@@ -20,8 +20,7 @@ from mitsuba_irrcache.gradients.parameters import (
     add_user,
     by_parameter,
     channels_of,
-    check_emission,
-    check_mean_cosine,
+    check_role,
     is_mean_cosine,
     key_of_node,
     nodes_of_emission,
@@ -113,10 +112,10 @@ class TracedAdjoint:
         media = list(media_of(scene))
         own = [media[part.medium.number] for part in parts]
         self._roles = roles_among(params, keys, own, scene, emission)
-        checks = {MEAN_COSINE: check_mean_cosine, EMISSION: check_emission}
         for key, role in self._roles.items():
-            if isinstance(role, tuple) and role[1] in checks:
-                checks[role[1]](key, parts[role[0]].medium)
+            if isinstance(role, tuple):
+                number, name = role
+                check_role(key, name, parts[number].medium)
 
     def view(self, film: FilmAdjoint) -> tuple[dict[str, object], list[mi.Float] | None]:
         """Return derivatives and adjoint fluence as `ParameterAdjoint.view`; the fluence of all

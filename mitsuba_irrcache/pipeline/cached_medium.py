@@ -298,10 +298,11 @@ class CachedMedium:
             if not warn_of_opaque_voxels(medium, grid, settings.max_depth):
                 warn_of_unresolved_detail(medium, grid)
             warn_of_unresolved_objects(medium, grid)
-            depth = mean_extinction(medium) * np.linalg.norm(medium.frame[:3, :3], axis=0).max()
-            if not medium.is_isolated and depth > SMALL_DEPTH:
-                name = f'medium "{medium.name}"'
-                warn_of_fine_shadows(scene, grid, self.description.emitters, name)
+            if not medium.is_isolated:
+                longest = np.linalg.norm(medium.frame[:3, :3], axis=0).max()
+                if mean_extinction(medium) * longest > SMALL_DEPTH:
+                    name = f'medium "{medium.name}"'
+                    warn_of_fine_shadows(scene, grid, self.description.emitters, name)
         whole = np.zeros(3, int), grid.resolution
         self.shared = None if medium.is_isolated else why_shared(scene, medium, grid, whole)
         active, classes = self._active_voxels(scene, grid)

@@ -44,6 +44,7 @@ from mitsuba_irrcache.transport.path import (
     position_on,
     power_heuristic,
     sample_bsdf,
+    straight_through,
     visibility,
 )
 
@@ -168,8 +169,7 @@ class SurfacePaths:
             path.travelled = mi.Float(travelled)
         while dr.hint(path.active, label="surface paths"):
             follower.advance(path, sums)
-        passed = dr.select(sums.interacted, 0, sums.passed)
-        return sums.emitted, sums.radiance, passed, sums.end_number, sums.end_factor
+        return sums.emitted, sums.radiance, sums.passed, sums.end_number, sums.end_factor
 
     @symbolic
     def direct(self, scene, si, pointer, sample, rng, active, where, exact: bool):
@@ -266,10 +266,7 @@ class SurfacePaths:
             weight = power_heuristic(density, emitter.pdf_direction(vertex, record, is_emitter))
             total += dr.select(is_emitter, attenuation * value * excess * weight, 0)
             hit = active & si.is_valid()
-            factor = si.bsdf().eval_null_transmission(si, hit)
-            attenuation = dr.select(hit, attenuation * factor, attenuation)
-            pointer = dr.select(hit, medium_after(si, ray.d, pointer), pointer)
-            ray = si.spawn_ray(ray.d)
+            ray, pointer, attenuation = straight_through(si, ray, pointer, attenuation, hit)
             crossings += 1
             active &= hit & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)
         # A line that exceeds the maximum number of crossings does not contribute.
@@ -421,8 +418,8 @@ class _PathSums:
 
     emitted: mi.Spectrum
     radiance: mi.Spectrum
-    interacted: mi.Bool
-    #: transmittance of the media before the first vertex, without that of a forward peak
+    #: transmittance of the media before hidden emitters and the background, without that of a
+    #: forward peak; 0 for paths with a vertex
     passed: mi.Spectrum
     end_number: mi.UInt32
     end_factor: mi.Spectrum
@@ -468,8 +465,7 @@ class _PathFollower:
             active=mi.Bool(active),
         )
         black, none = mi.Spectrum(0), mi.UInt32(0)
-        passed = mi.Spectrum(1)
-        return path, _PathSums(black, mi.Spectrum(0), mi.Bool(False), passed, none, mi.Spectrum(0))
+        return path, _PathSums(black, mi.Spectrum(0), mi.Spectrum(1), none, mi.Spectrum(0))
 
     def advance(self, path: _FollowedPath, sums: _PathSums) -> None:
         """Trace paths to their next surface, and sample the direction in which they continue."""
@@ -585,7 +581,7 @@ class _PathFollower:
         else:
             known = paths.irradiance_at(numbers, weights, ends)
             sums.radiance += dr.select(ends, path.throughput * factor * known, 0)
-        sums.interacted |= ends
+        sums.passed = dr.select(ends, 0, sums.passed)
         return ends
 
     def _add_sampled_emitters(
@@ -634,7 +630,7 @@ class _PathFollower:
         path.last = dr.select(is_vertex, vertex, path.last)
         path.share = dr.select(is_vertex, 1, path.share)
         path.first &= ~is_vertex
-        sums.interacted |= is_vertex
+        sums.passed = dr.select(is_vertex, 0, sums.passed)
         path.depth = dr.select(is_vertex, path.depth + 1, path.depth)
         direction = dr.select(scatters, direction, path.ray.d)
         goes_on = crosses | scatters

@@ -193,6 +193,22 @@ def medium_after(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, pointer: m
     return dr.select(si.is_medium_transition(), si.target_medium(direction), pointer)
 
 
+def straight_through(
+    si: mi.SurfaceInteraction3f,
+    ray: mi.Ray3f,
+    pointer: mi.MediumPtr,
+    attenuation: mi.Spectrum,
+    hit: mi.Bool,
+) -> tuple[mi.Ray3f, mi.MediumPtr, mi.Spectrum]:
+    """Return the rays behind the surfaces that they ``hit``, their media, and the ``attenuation``
+    with what the surfaces let through straight.
+    """
+    factor = si.bsdf().eval_null_transmission(si, hit)
+    attenuation = dr.select(hit, attenuation * factor, attenuation)
+    pointer = dr.select(hit, medium_after(si, ray.d, pointer), pointer)
+    return si.spawn_ray(ray.d), pointer, attenuation
+
+
 def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
     """Return the weight of a sample with density ``a`` and alternative density ``b``.
 
@@ -277,10 +293,7 @@ def trace_to_infinity(
         for lamp in lamps:
             hit_lamp = hit & (si.shape.emitter() == lamp)
             radiance += dr.select(hit_lamp, attenuation * si.shape.emitter().eval(si, hit_lamp), 0)
-        factor = si.bsdf().eval_null_transmission(si, hit)
-        attenuation = dr.select(hit, attenuation * factor, attenuation)
-        pointer = dr.select(hit, medium_after(si, ray.d, pointer), pointer)
-        ray = si.spawn_ray(ray.d)
+        ray, pointer, attenuation = straight_through(si, ray, pointer, attenuation, hit)
         crossings += 1
         active &= hit & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)
     return dr.select(escaped, attenuation, 0), radiance, rng

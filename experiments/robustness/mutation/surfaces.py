@@ -185,8 +185,8 @@ SURFACES = (
     Mutant(
         "rays from the BSDF end at emitters that let light through",
         "render/surface_paths.py",
-        "attenuation = dr.select(hit, attenuation * factor, attenuation)",
-        "attenuation = dr.select(hit, attenuation * factor * ~is_emitter, attenuation)",
+        "active &= hit & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)",
+        "active &= hit & ~is_emitter & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)",
         (IMAGES,),
     ),
     Mutant(
