@@ -32,6 +32,9 @@ CLEARANCE = 3.5
 LARGEST_CLEARANCE = 0.05
 #: Weight of the condition that vertices stay in the planes of faces that do not touch surfaces.
 OTHER_FACES = 1e-3
+#: Parameters of shapes that describe where they are. Normals are among them, because Mitsuba
+#: computes those of a mesh anew if only its vertices have changed.
+POSITION_PARAMETERS = ("vertex_positions", "vertex_normals", "to_world", "control_points", "data")
 #: Excludes other threads while objects, which scenes share, have other names and bounds.
 _NAMING = RLock()
 
@@ -107,6 +110,7 @@ def separated(scene: mi.Scene) -> mi.Scene | None:
 
 def _scene_of(objects: list[mi.Object]) -> mi.Scene:
     """Return a scene of existing objects."""
+    _mark_groups_as_moved(objects)
     with _NAMING:
         names = [obj.id() for obj in objects]
         numbered = {f"object{number}": obj for number, obj in enumerate(objects)}
@@ -114,6 +118,28 @@ def _scene_of(objects: list[mi.Object]) -> mi.Scene:
         for obj, name in zip(objects, names, strict=True):
             obj.set_id(name)  # Mitsuba has replaced it by the key
     return scene
+
+
+def _mark_groups_as_moved(objects: list[mi.Object]) -> None:
+    """Make the next scene build its own acceleration structures of groups of shapes.
+
+    On GPUs, Mitsuba 3.9 builds them only for groups that have changed since the last scene with
+    them, and otherwise reads beyond the end of an empty list.
+    """
+    if dr.backend_v(mi.Float) != dr.JitBackend.CUDA:
+        return
+    for group in objects:
+        if group.class_name() == "ShapeGroupPlugin":
+            mark_as_moved(group)
+
+
+def mark_as_moved(group: mi.Object) -> None:
+    """Declare the positions of shapes as changed, without a change."""
+    params = mi.traverse(group)
+    for key in params.keys():
+        if key.rpartition(".")[2] in POSITION_PARAMETERS:
+            params.set_dirty(key)
+    params.update()
 
 
 def _only_bounds_medium(shape: mi.Shape) -> bool:

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import UnsupportedSceneError
-from mitsuba_irrcache.scene.clearance import CLEARANCE, SeparatedScene, separated
+from mitsuba_irrcache.scene.clearance import (
+    CLEARANCE,
+    SeparatedScene,
+    mark_as_moved,
+    separated,
+)
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.consistency import RAY_OFFSET
 from tests.support.surfaces import bound, fog, lamp, placed, ref
@@ -263,6 +268,24 @@ def test_instances_remain():
     result = separated(loaded(tree=tree, instance=instance, floor=floor()))
     si = result.ray_intersect(mi.Ray3f([2, 5, 0], [0, -1, 0]))
     assert abs(float(si.t[0]) - 4.9) < 1e-5
+
+
+def test_shapes_marked_as_moved_stay():
+    """Neither the positions of shapes of a group nor normals that a user has set change."""
+    group = mi.load_dict({
+        "type": "shapegroup", "trunk": {"type": "cube"}, "crown": {"type": "sphere", "radius": 0.4}
+    })  # fmt: skip
+    params = mi.traverse(group)
+    params["trunk.vertex_normals"] = mi.Float(np.tile([0.0, 0.6, 0.8], 24))
+    params.update()
+    keys = [k for k in params.keys() if k.startswith(("trunk", "crown")) and "bsdf" not in k]
+    before = {key: np.array(params[key]) for key in keys if key != "crown.to_world"}
+    box = [np.array(group.bbox().min), np.array(group.bbox().max)]
+    mark_as_moved(group)
+    params = mi.traverse(group)
+    for key, value in before.items():
+        assert (np.array(params[key]) == value).all(), key
+    assert (np.array([group.bbox().min, group.bbox().max]) == np.array(box)).all()
 
 
 def test_thin_boxes_are_named(logged):
