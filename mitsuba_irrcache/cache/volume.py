@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
-from threading import RLock
 from typing import Any
 
 import drjit as dr
@@ -25,6 +24,7 @@ from mitsuba_irrcache.cache.interpolation import PLAIN, Interpolation
 from mitsuba_irrcache.cache.lookups import border_of, irradiance_field, moment_field, on_grid
 from mitsuba_irrcache.cache.statistics import BATCH, BatchSums
 from mitsuba_irrcache.cache.storage import StoredCache, read_cache, read_description, write_cache
+from mitsuba_irrcache.core.locks import ComputationLock
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
@@ -75,7 +75,7 @@ class IrradianceCache:
         scattering. ``correlated`` states that all voxels share their samples, and hence their
         errors.
         """
-        self._lock = RLock()
+        self._lock = ComputationLock()
         self.grid = grid
         self.batch = batch  #: samples per batch
         self.active = active

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from threading import RLock
 from time import perf_counter
 
 import drjit as dr
@@ -13,6 +12,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.cancellation import Pause
+from mitsuba_irrcache.core.locks import ComputationLock
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.bake_emission import bake_emission
 from mitsuba_irrcache.media.emission import Emission
@@ -55,7 +55,7 @@ class CacheBuilder:
     ) -> None:
         """``emission`` is the argument of `bake_emission`; None: media do not emit."""
         self.settings = settings
-        self.lock = RLock()
+        self.lock = ComputationLock()
         self._emission, self._emission_scale = emission, emission_scale
         #: samples per voxel to build up to (0: the default); a higher number refines the caches
         self.samples = settings.samples

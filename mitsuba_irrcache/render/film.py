@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from threading import Lock, RLock
+from threading import Lock
 from typing import NamedTuple
 
 import drjit as dr
@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import Divisor
+from mitsuba_irrcache.core.locks import ComputationLock
 from mitsuba_irrcache.core.sequences import kronecker, kronecker_words, unit_floats
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
@@ -50,7 +51,7 @@ SPP_LIMIT = 1 << 32
 RadianceFunction = Callable[..., tuple]
 
 #: Films in use by threads: the lock of each, and the number of threads that hold or await it.
-_films: dict[mi.Film, tuple[RLock, int]] = {}
+_films: dict[mi.Film, tuple[ComputationLock, int]] = {}
 _films_lock = Lock()
 
 
@@ -59,7 +60,7 @@ def exclusive(film: mi.Film) -> Iterator[None]:
     """Exclude other threads from the same ``film``, which can store one image only."""
     with _films_lock:
         lock, users = _films.get(film, (None, 0))
-        lock = lock or RLock()
+        lock = lock or ComputationLock()
         _films[film] = lock, users + 1
     try:
         with lock:
