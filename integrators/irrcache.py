@@ -562,10 +562,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     @contextmanager
     def exclusively(self) -> Iterator[None]:
-        """Exclude other threads from the cache, for computations of gradients."""
-        # ptxas aborts the process if a kernel with calls that cannot be inlined, as those of
-        # emitters in gradient passes, stores registers in shared memory.
-        with self._builder.lock, dr.scoped_set_flag(dr.JitFlag.SpillToSharedMemory, False):
+        """Exclude other threads from the cache."""
+        with self._builder.lock:
             yield
 
     def revision(self, scene: mi.Scene) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from functools import cache
+from functools import cache, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -120,15 +120,16 @@ def scene_image(built: mi.Scene) -> np.ndarray:
     return np.array(mi.render(built, spp=5, seed=5))
 
 
-def _look_elsewhere(kind: str) -> tuple[np.ndarray, np.ndarray]:
-    mi.set_variant("llvm_ad_rgb")
+def _look_elsewhere(variant: str, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
     return look(kind)
 
 
 def test_in_another_process():
+    elsewhere = partial(_look_elsewhere, mi.variant())
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        for kind, found in zip(KINDS, pool.map(_look_elsewhere, KINDS), strict=True):
+        for kind, found in zip(KINDS, pool.map(elsewhere, KINDS), strict=True):
             assert_same(found, once(kind))
 
 

@@ -276,6 +276,8 @@ def test_constants_are_not_looked_up(scenes, kernels):
     A constant albedo takes fewer loads, a constant extinction the fewest, and no ray is intersected
     with the scene.
     """
+    if not mi.variant().startswith("llvm"):
+        pytest.skip("counts loads in the code for LLVM")
     values = scenes.texture((8, 8, 8), 0.2, 2.0, 1)
     albedos = scenes.texture((8, 8, 8, 3), 0.2, 0.9, 2)
     varied, constant, homogeneous = (

@@ -52,3 +52,14 @@ def test_the_lock_excludes_other_threads_and_is_reentrant():
         order.append("own")
     thread.join()
     assert order == ["own", "other"]
+
+
+def test_registers_are_not_stored_in_shared_memory():
+    """The flag is off while the lock is held, and then as before, also after an error."""
+    lock, flag = ComputationLock(), dr.JitFlag.SpillToSharedMemory
+    for before in (True, False):
+        with dr.scoped_set_flag(flag, before):
+            with pytest.raises(ValueError, match="inner"), lock, lock:
+                assert not dr.flag(flag)
+                raise ValueError("inner")
+            assert dr.flag(flag) == before
