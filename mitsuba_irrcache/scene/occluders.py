@@ -16,7 +16,6 @@ from mitsuba_irrcache.scene.consistency import described
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     flags_of,
-    is_null,
     is_solid,
     is_surface,
     transmits,
@@ -184,17 +183,23 @@ def first_surface(
 
 
 def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:
-    """Return the name of a null shape that has ``medium`` as its exterior: a hole in the medium.
+    """Return the name of a shape that rays pass straight (null, thin glass, a mask) and that has
+    ``medium`` as its exterior only: a hole in the medium.
 
     Only shapes in the ``box`` (lower, upper) of voxels of ``grid`` count; None without any.
     """
     for shape in scene.shapes():
-        outer = shape.exterior_medium()
-        null = is_null(flags_of(shape))
-        if outer is None or not null or not dr.all(mi.MediumPtr(outer) == medium.pointer):
+        sides = shape.exterior_medium(), shape.interior_medium()
+        outside, inside = (_is_medium(side, medium) for side in sides)
+        if not flags_of(shape) & int(mi.BSDFFlags.Null) or inside or not outside:
             continue
         ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
         corners = np.array(list(itertools.product(*ends.T)))
         if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
             return described(shape)
     return None
+
+
+def _is_medium(found: mi.Medium | None, medium: MediumGrid) -> bool:
+    """Return whether Mitsuba's medium ``found`` is that of ``medium``."""
+    return found is not None and dr.all(mi.MediumPtr(found) == medium.pointer)
