@@ -14,7 +14,7 @@ class NoSurroundings:
 
     refracts, carries_refracted = False, True
 
-    has_sources, angular_basis = False, None
+    has_sources, angular_basis, surfaces = False, None, None
 
     @staticmethod
     def crossings(tracks, ordinates) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.solvers.discrete_ordinates import boundary_condition
 from tests.support.slow import with_slow
 from tests.support.surfaces import ball, blocks, bound, diffuse, fog, images, lamp, placed, ref
 
@@ -302,3 +305,65 @@ def test_values_are_not_extrapolated_across_surfaces(scenes, solver):
     _, cache = rendered(scenes, objects, solver=solver, resolution=32)
     largest = np.array(cache.irradiance).max()
     assert cache.field().maximum < 4 * largest
+
+
+@pytest.mark.parametrize("thickness", [0.004, 0.1])
+def test_no_light_enters_a_closed_room(scenes, monkeypatch, thickness):
+    """One medium fills two rooms that a wall separates: the one without a lamp is dark.
+
+    Tracks on both sides of the wall would share a path from the face of the medium if few paths
+    were traced, as on fine grids.
+    """
+    monkeypatch.setattr(boundary_condition, "PATH_CELLS", 64)
+    white = diffuse(0.7, 0.7, 0.7)
+    objects = {
+        "fog": bound(interior=fog((0.5,) * 3), scale=(0.99, 0.99, 0.99)),
+        "room": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": white}},
+        "wall": {
+            "type": "cube", "bsdf": white, "to_world": placed(scale=(0.5 * thickness, 1.1, 1.1))
+        },
+        "lamp": lamp((-0.98, 0.1, 0.0), (1, 0, 0)),
+    }  # fmt: skip
+    settings = {"type": "irrcache", "solver": "sweep", "resolution": 24, "cache_spp": 64}
+    scene = mi.load_dict({"type": "scene", "integrator": settings, **objects}, optimize=False)
+    scene.integrator().prepare(scene)
+    cache = scene.integrator().cache
+    x = (np.arange(24) + 0.5) / 24 * 1.98 - 0.99
+    irradiance = np.array(cache.irradiance)[..., 0]
+    lit, dark = irradiance[..., x < -0.1], irradiance[..., x > 0.1]
+    assert lit.min() > 0.1
+    assert dark.max() < 1e-4 * lit.mean()
+
+
+@pytest.mark.parametrize(
+    ("walls", "resolution"), [("one shape", 24), ("one shape", 31), ("six rectangles", 32)]
+)
+def test_no_light_enters_a_room_within_a_medium(scenes, walls, resolution):
+    """The irradiance in a closed room does not depend on the sky outside: at its edges, where two
+    surfaces hide the nearest voxels, and in the gap between its lamp and ceiling, which contains no
+    centre of a voxel. The walls may lie anywhere in voxels.
+    """
+    white = {"type": "twosided", "bsdf": diffuse(0.7, 0.7, 0.7)}
+    room = {"room": {"type": "cube", "bsdf": white}}
+    if walls == "six rectangles":
+        room = {}
+        for axis, sign in itertools.product(range(3), (-1, 1)):
+            center, up = np.eye(3)[axis] * sign, np.eye(3)[axis - 1]
+            place = mi.ScalarTransform4f().look_at(center, [0, 0, 0], up).scale([1.001, 1.001, 1])
+            room[f"{axis}{sign}"] = {"type": "rectangle", "bsdf": white, "to_world": place}
+    objects = {
+        "fog": bound(interior=fog((0.5,) * 3), scale=(1.2, 1.2, 1.2)),
+        "lamp": lamp((0, 0.98, 0), (0, 0, 0), 0.3, (0.05, 0.05, 0.05)),
+    }
+    settings = {"type": "irrcache", "solver": "sweep", "resolution": resolution, "cache_spp": 64}
+    objects |= {"integrator": settings} | room
+    inside = np.abs((np.arange(resolution) + 0.5) / resolution * 2.4 - 1.2) < 0.99
+    found = []
+    for radiance in (1.0, 2.0):
+        sky = {"type": "constant", "radiance": radiance}
+        scene = mi.load_dict({"type": "scene", "sky": sky, **objects}, optimize=False)
+        scene.integrator().prepare(scene)
+        found.append(np.array(scene.integrator().cache.irradiance)[..., 0])
+    change = found[1] - found[0]
+    assert found[0][np.ix_(inside, inside, inside)].mean() > 0.01
+    assert np.abs(change[np.ix_(inside, inside, inside)]).max() < 1e-5 * change[0].mean()

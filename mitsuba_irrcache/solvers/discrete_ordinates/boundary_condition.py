@@ -46,8 +46,10 @@ from mitsuba_irrcache.transport.path_tracer import PathStart, PathTracer
 
 #: Approximate maximum number of cells of an ordinate, for paths (one per cell), and for ordinates
 #: along which only the visibility of emitters is tested, which is cheaper. Radiance from surfaces
-#: varies more between ordinates than between neighbouring tracks.
-PATH_CELLS, EMITTER_CELLS = 1 << 11, 1 << 16
+#: varies more between ordinates than between neighbouring tracks, unless walls in the medium
+#: separate these. Then every track has its own path on grids of up to about 140^3 voxels; on
+#: larger ones 2 x 2 tracks share one, to limit the memory.
+PATH_CELLS, EMITTER_CELLS, SEPARATED_CELLS = 1 << 11, 1 << 16, 1 << 15
 #: Paths begin at this distance inside the box [voxels]: surfaces may lie on its faces.
 INSET = 1e-3
 #: Offset of the random streams of paths from surfaces among the voxels.
@@ -150,7 +152,9 @@ class IncomingRadiance:
         self.has_emitters = [part.any(axis=(1, 2)) for part in parts]
         self.has_emitters[0] |= (weights > 0) & boundary.has_sources
         self._geometry = tracks.table(directions, incoming[..., 0], weights, offsets).geometry
-        self._lay_out_cells(np.where(weights > 0, PATH_CELLS, EMITTER_CELLS))
+        is_divided = boundary.surfaces is not None and boundary.surfaces.meet_faces
+        path_cells = SEPARATED_CELLS if is_divided else PATH_CELLS
+        self._lay_out_cells(np.where(weights > 0, path_cells, EMITTER_CELLS))
         #: where tracks cross surfaces among the voxels
         self.crossings = boundary.crossings(tracks, ordinates)
         parameters = self._parameters(directions, parts, weights)
@@ -571,7 +575,8 @@ def _trace_all(
             voxel = voxel_at(incoming.tracks.grid, end.p)
         else:
             collides = dr.max(end.weight) > 0
-            voxel = boundary.surfaces.nearest(end.p, collides)
+            voxel, known = boundary.surfaces.nearest(end.p, collides)
+            reflected = dr.select(known, reflected, 0)
             if boundary.cut_voxel_light is not None:
                 own = voxel_at(incoming.tracks.grid, end.p)
                 collides &= boundary.surfaces.is_cut_at(own)

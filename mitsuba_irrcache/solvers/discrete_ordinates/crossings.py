@@ -23,7 +23,11 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import first_surface
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import block_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
-from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackCrossings, TrackGeometry
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import (
+    NO_VOXEL,
+    TrackCrossings,
+    TrackGeometry,
+)
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_solid
 
 #: Rays along each edge of a voxel's face that detect surfaces in it.
@@ -49,6 +53,7 @@ class SurfaceVoxels:
         voxels: flat indices of the voxels that surfaces cut and of their neighbours, ascending.
         number: for each voxel of the grid, 1 + its index in ``voxels``; 0 if it is not among them.
         is_cut: for each voxel of the grid, whether a surface cuts it.
+        meet_faces: whether surfaces cut voxels at the faces of the box.
     """
 
     def __init__(
@@ -69,6 +74,7 @@ class SurfaceVoxels:
             dr.eval(marks)
         self.is_cut = self._within(marks > 0)
         dr.eval(self.is_cut)
+        self.meet_faces = bool(dr.any(self.is_cut & ~self._within(True, inset=1))[0])
         #: mask of the voxels of the medium whose centres are outside of its boundary
         self._beyond = mi.Bool(False)
         if medium is not None:
@@ -108,7 +114,8 @@ class SurfaceVoxels:
         """Return the voxel whose value applies at world positions.
 
         It is the voxel that contains the position or, if a surface cuts that, the nearest of it and
-        its neighbours whose centre is on the same side of surfaces.
+        its neighbours whose centre is on the same side of surfaces. Also returns whether there is
+        one: not in gaps between surfaces that contain no centre.
         """
         u = self.grid.coordinates.point(p)
         own = voxel_at(self.grid, p)
@@ -125,13 +132,13 @@ class SurfaceVoxels:
             nearer = ~hidden & (distance < best)
             best, voxel = dr.select(nearer, distance, best), dr.select(nearer, there, voxel)
             k += 1
-        return voxel
+        return voxel, ~active | (best < dr.inf)
 
-    def _within(self, marks: mi.Bool) -> mi.Bool:
-        """Restrict marks of all voxels to those in the box."""
+    def _within(self, marks: mi.Bool, inset: int = 0) -> mi.Bool:
+        """Restrict marks of all voxels to those in the box, and ``inset`` voxels from its faces."""
         at = self.grid.voxel_indices(dr.arange(mi.UInt32, self.grid.voxel_count))
         for k, low, high in zip(at, self.lower, self.upper, strict=True):
-            marks = marks & (k >= int(low)) & (k < int(high))
+            marks = marks & (k >= int(low) + inset) & (k + inset < int(high))
         return marks
 
 
@@ -226,6 +233,8 @@ class SurfaceCrossings:
         is_before = back | ~crosses
         hidden = dr.select(is_before, before, behind) < 1
         voxel = dr.select(is_before, voxels.x, voxels.y)
+        hidden &= voxel != NO_VOXEL
+        voxel = dr.select(hidden, voxel, 0)
         end = dr.maximum(begin, end)
         return segment.at(begin), segment.at(end), voxel, crosses, hidden
 
@@ -323,7 +332,8 @@ def _side(
     """Return whether a position on a segment is on the same side of surfaces as the centre of its
     voxel (1 or 0), and the voxel whose source applies there.
 
-    On the other side that is a neighbouring voxel, one voxel away from the surface.
+    On the other side that is a neighbouring voxel, one voxel away from the surface, or the nearest
+    one if another surface hides that, as at edges; none (`NO_VOXEL`) in gaps without any centre.
     """
     surfaces, p = crossings.surfaces, segment.at(position)
     hidden, normal = surfaces.hidden(segment.voxel, segment.centre, p, active)
@@ -331,6 +341,9 @@ def _side(
     step = surfaces.grid.coordinates.vector(mi.Vector3f(normal))
     step /= dr.maximum(dr.max(dr.abs(step)), 1e-30)
     away = voxel_at(surfaces.grid, p + surfaces.grid.world.vector(step))
+    *_, behind = first_surface(surfaces.scene, p, surfaces.grid.centers(away), hidden)
+    nearest, known = surfaces.nearest(p, behind)
+    away = dr.select(behind, dr.select(known, nearest, NO_VOXEL), away)
     return dr.select(hidden, mi.Float(0), 1), dr.select(hidden, away, segment.voxel)
 
 

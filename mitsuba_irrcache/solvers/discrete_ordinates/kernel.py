@@ -25,7 +25,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
     TrackRecord,
     TransverseFields,
 )
-from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import NO_VOXEL, TrackTable
 
 
 @dataclass(frozen=True)
@@ -739,7 +739,10 @@ class _PairSweep:
         depth = self.solid_angle * (before * ahead + behind * beyond) * self.area
         channels = range(self.volume.channels)
         sources = [
-            [self._source(source, voxel * len(channels) + c, slot > 0) for c in channels]
+            [
+                self._source(source, voxel * len(channels) + c, (slot > 0) & (voxel != NO_VOXEL))
+                for c in channels
+            ]
             for voxel in voxels
         ]
         carried, tallies = [], []

@@ -40,9 +40,13 @@ COARSEST = 20
 MAX_CYCLES = 12
 #: Optical depth of a voxel above which collisions are computed from the loss of radiance in it.
 THIN = 1e-2
-#: Relative error of the solution on the finest grid; relative changes at which the iteration on the
-#: coarsest grid ends, if that is the only grid, and if it only corrects finer ones.
+#: Relative error of the solution on the finest grid.
 TOLERANCE = 1e-3
+#: Where surfaces divide the voxels, rooms may be darker than the rest: errors are relative to the
+#: irradiance of each voxel plus this share of the mean.
+LOWEST_IRRADIANCE = 1e-2
+#: Relative changes at which the iteration on the coarsest grid ends, if that is the only grid, and
+#: if it only corrects finer ones.
 COARSEST_TOLERANCE, CORRECTION_TOLERANCE = 2e-4, 3e-2
 #: Maximum number of iterations on the coarsest grid, and of iterates that Anderson acceleration
 #: combines.
@@ -316,8 +320,10 @@ class MultigridLevel:
         acceleration = AndersonAcceleration(self._scattered_sums)
         for _ in range(MAX_CYCLES if not self.coarsest and nonzero else 0):
             image = self.cycle(phi, b, tables)
-            scale = self._scattered_sums(dr.abs, image)
-            last, change = change, self._scattered_sums(lambda a, b: dr.abs(a - b), image, phi)
+            weights = None if self.tracks.surfaces is None else self._weights(image)
+            scale = self._scattered_sums(dr.abs, image, weights=weights)
+            last = change
+            change = self._scattered_sums(lambda a, b: dr.abs(a - b), image, phi, weights=weights)
             # Errors decay by about the same factor in each cycle. It is bounded from below, because
             # the first factors may be small: slowly converging errors dominate only later.
             factor = np.clip(change / np.maximum(last, TINY), 0.5, 0.95)
@@ -335,9 +341,27 @@ class MultigridLevel:
                 )
         return phi
 
-    def _scattered_sums(self, integrand: Callable, *fields: mi.Float) -> np.ndarray:
-        """Return sums of ``integrand(*fields)`` per channel, weighted by the scattering
-        coefficient.
+    def _weights(self, phi: mi.Float) -> mi.Float:
+        """Return the weights of all voxels and channels in the error: one over the irradiance plus
+        `LOWEST_IRRADIANCE` times its mean.
+        """
+        count, channels = self.tracks.active_count, self.channels
+        place = dr.arange(mi.UInt32, count * channels)
+        irradiance = dr.abs(dr.gather(mi.Float, phi, place))
+        channel, weights = place % dr.opaque(mi.UInt32, channels), mi.Float(0)
+        for c in range(channels):
+            own = dr.select(channel == c, irradiance, 0)
+            lowest = dr.sum(own) * (LOWEST_IRRADIANCE / count)
+            weight = 1 / dr.maximum(irradiance + lowest, np.finfo(np.float32).tiny)
+            weights = dr.select(channel == c, weight, weights)
+        dr.eval(weights)
+        return weights
+
+    def _scattered_sums(
+        self, integrand: Callable, *fields: mi.Float, weights: mi.Float | None = None
+    ) -> np.ndarray:
+        """Return sums of ``integrand(*fields)`` per channel, weighted by the scattering coefficient
+        and by the ``weights`` of voxels and channels (None: 1).
         """
         channels, voxels = self.channels, dr.opaque(mi.UInt32, self.tracks.active_count)
         place = dr.arange(mi.UInt32, self._measured * self.tracks.active_count)
@@ -345,8 +369,10 @@ class MultigridLevel:
         weight, sums = dr.gather(mi.Float, self.sigma_t, voxel), []
         for c in range(channels):
             value = integrand(*(dr.gather(mi.Float, x, place * channels + c) for x in fields))
-            albedo = dr.gather(mi.Float, self.albedo, voxel * channels + c)
-            sums.append(dr.sum(value * albedo * weight))
+            share = weight * dr.gather(mi.Float, self.albedo, voxel * channels + c)
+            if weights is not None:
+                share *= dr.gather(mi.Float, weights, voxel * channels + c)
+            sums.append(dr.sum(value * share))
         dr.eval(sums)
         return np.array([float(total[0]) for total in sums])
 

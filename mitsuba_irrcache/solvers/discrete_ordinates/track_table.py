@@ -98,6 +98,10 @@ class PairGroup:
         return self.table.records.direction(self.pair(number))
 
 
+#: Stands for a voxel where none is known, whose source is 0.
+NO_VOXEL = 0xFFFFFFFF
+
+
 class TrackCrossings:
     """Crossings of the tracks of a table with surfaces among the voxels, see `SurfaceCrossings`."""
 

@@ -88,7 +88,7 @@ def test_the_nearest_voxel_is_on_the_same_side():
     centre = np.array([0.05, -0.02, 0.01])
     for radius, outside in ((0.61, True), (0.59, False)):
         p = mi.Point3f(np.float32(centre + radius * d).T)
-        voxel = surfaces.nearest(p, mi.Bool(True))
+        voxel, _ = surfaces.nearest(p, mi.Bool(True))
         found = np.array(grid().centers(voxel)).T
         distance = np.linalg.norm(found - centre, axis=1)
         assert ((distance > 0.6) == outside).mean() > 0.995
