@@ -54,6 +54,8 @@ EMISSION_STEPS = 4
 UNCACHED_CELLS = 32
 #: Multiple of the offset of a ray whose fraction is another random number.
 FRACTION = 1024.0
+#: Distance from the surfaces at its ends that a ray keeps in lookups in cut cells [cells].
+SURFACE_MARGIN = 0.01
 #: Maximum optical depth per step of the packed extinction: the 16-bit format has a limited range,
 #: which larger values would waste.
 OPAQUE = 4096.0
@@ -187,6 +189,7 @@ class Projection:
         peak: Sequence = (),
         length: mi.Float | None = None,
         scattering: Scattering = Scattering.ALL,
+        bounds: tuple[mi.Float, mi.Float] | None = None,
     ) -> tuple:
         """Evaluate the fields at the distance ``t``.
 
@@ -198,7 +201,8 @@ class Projection:
         ``peak`` is the optical depth of scattering into a truncated forward peak between the camera
         and the beginning of a segment of this ``length`` that ends at ``t``, and the extinction of
         the peak there. If it is empty, scattering into a truncated peak is excluded. ``scattering``
-        selects the radiance that is scattered.
+        selects the radiance that is scattered. ``bounds`` are the distances between which the ray
+        is in the medium, None if it does not end at surfaces.
         """
         # docs/primer, eq. (1.3)
         p, active = fields.ray(t), mi.Bool(True)
@@ -207,7 +211,8 @@ class Projection:
         if not self.has_cache:
             return sigma_t, mi.Float(0), extras, []
         phi, albedo = rest
-        phi = self._exclude_occluded(p, phi, active)
+        beside = p if bounds is None else fields.ray(self._within(t, *bounds))
+        phi = self._exclude_occluded(beside, phi, active)
         if self.uncertainty is not None:
             extras += self.uncertainty.at_world(p, phi, active)
         if peak:
@@ -273,6 +278,17 @@ class Projection:
         if self._exponent is None:
             return dr.exp(-mi.Spectrum(optical_depth(self.medium.original, ray, near, far, active)))
         return dr.power(transmittance, self._exponent)
+
+    def _within(self, t: mi.Float, near: mi.Float, far: mi.Float) -> mi.Float:
+        """Return the distance next to ``t`` that is certainly between those of the surfaces at
+        which a ray begins and ends.
+
+        On a surface, rounding errors would determine of which side values are looked up.
+        """
+        if self._edges is None:
+            return t
+        margin = dr.minimum(SURFACE_MARGIN * self.cell, 0.5 * (far - near))
+        return dr.clip(t, near + margin, far - margin)
 
     def _exclude_occluded(
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool
@@ -517,7 +533,13 @@ class _RayMarch:
         length = end - state.t
         self._skip_empty_space(state, skip)
         *values, peak = projection.fetch(
-            self._fields, end, self._view, state.peak, length, self._scattering
+            self._fields,
+            end,
+            self._view,
+            state.peak,
+            length,
+            self._scattering,
+            (self._near, self._far),
         )
         there = _FieldSample(*values)
         before = self._with_inner_sources(state, there)

@@ -153,10 +153,16 @@ def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
 
 @symbolic
 def first_surface(
-    scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f, active: mi.Bool, opaque: bool = False
+    scene: mi.Scene,
+    start: mi.Point3f,
+    stop: mi.Point3f,
+    active: mi.Bool,
+    opaque: bool = False,
+    ignored: mi.MediumPtr | None = None,
 ):
     """Find the first surface between ``start`` and ``stop`` that is not a null boundary; if
-    ``opaque``, the first one that transmits nothing.
+    ``opaque``, the first one that transmits nothing. Surfaces that bound the medium ``ignored``,
+    if given, are skipped.
 
     Returns its distance from ``start`` (0 without one), its normal, and whether there is one.
     """
@@ -171,6 +177,8 @@ def first_surface(
         solid = active & is_solid(si)
         if dr.hint(opaque, mode="scalar"):
             solid &= ~transmits(si.bsdf().flags())
+        if dr.hint(ignored is not None, mode="scalar"):
+            solid &= si.shape.interior_medium() != ignored
         crossed = dr.norm(si.p - start)
         distance = dr.select(solid, crossed, distance)
         normal = dr.select(solid, si.n, normal)

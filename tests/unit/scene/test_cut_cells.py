@@ -70,6 +70,48 @@ def test_uncut_cells_are_unchanged(unit):
     assert (sided != np.array(plain)).any()
 
 
+def house(inner: float, thickness: float) -> mi.Scene:
+    """Return a closed house around the origin: five solid boxes that overlap, on a floor."""
+    scale, translate = mi.ScalarTransform4f().scale, mi.ScalarTransform4f().translate
+    half = 0.5 * thickness
+    shapes = {"floor": translate([0, 0, -inner]) @ scale(5)}
+    for axis, sign in [(0, -1), (0, 1), (1, -1), (1, 1), (2, 1)]:
+        middle = [0.0, 0.0, 0.0]
+        middle[axis] = sign * (inner + half)
+        size = [inner + half + 0.001 * axis] * 3
+        size[axis] = half
+        shapes[f"wall {axis} {sign}"] = translate(middle) @ scale(size)
+    kinds = {name: "rectangle" if name == "floor" else "cube" for name in shapes}
+    walls = {name: {"type": kinds[name], "to_world": place} for name, place in shapes.items()}
+    return mi.load_dict({"type": "scene", **walls}, optimize=False)
+
+
+@pytest.mark.parametrize("thickness", [0.02, 0.1, 0.3])
+@pytest.mark.parametrize("size", [0.2, 0.22, 0.25, 0.3, 0.32])
+def test_lookups_in_a_closed_house_do_not_leak(rgb, size, thickness):
+    """Lookups in a closed house read no voxel outside of it, wherever its edges and corners are
+    relative to voxels. Some walls are thinner than a voxel, and some faces lie on voxel centres.
+    """
+    inner = 1.0
+    count = round(3.4 / size)
+    place = np.diag([count * size] * 3 + [1.0])
+    place[:3, 3] = -inner - size * np.array([3.0, 2.5, 2.7])
+    grid = Grid((count, count, count), place)
+    centers = np.array(grid.centers(dr.arange(mi.UInt32, grid.voxel_count)))
+    indoors = np.abs(centers).max(axis=0) < inner
+    roots = np.where(indoors, 1.0, 7.0).astype(np.float32)
+    solid = (np.abs(centers).max(axis=0) < inner + thickness) & ~indoors
+    roots[solid & (centers[2] > -inner)] = 0
+    field = RootField(grid, mi.Float(roots), 1)
+    rng = np.random.default_rng(4)
+    u = rng.uniform(-1, 1, (3, 40000))
+    p = mi.Point3f(np.float32(np.sign(u) * np.abs(u) ** 0.3 * (inner - 1e-4)))
+    found = CutCells(house(inner, thickness), grid).corrected(
+        field, p, field.at_world(p), mi.Bool(True)
+    )
+    np.testing.assert_allclose(np.array(found), 1.0, rtol=1e-5)
+
+
 def test_empty_space_has_no_edges(unit):
     ball = {"type": "sphere", "center": [3, 3, 3]}
     null = {"type": "sphere", "bsdf": {"type": "null"}}
