@@ -16,9 +16,9 @@ from mitsuba_irrcache.grids.root_field import ExtendedField, Extension, RootFiel
 from mitsuba_irrcache.scene.cell_sides import (
     CORNERS,
     PER_WORD,
-    PLANES,
     WORDS,
     CellSides,
+    planes_of,
     region_of,
 )
 
@@ -60,10 +60,7 @@ class CutCells:
         number = dr.gather(mi.UInt32, self._number, index, active)
         if active & (number > 0):
             record = number - 1
-            planes = [
-                dr.gather(mi.Vector4f, self._planes, record * PLANES + k) for k in range(PLANES)
-            ]
-            region = region_of(planes, s)
+            region = region_of(planes_of(self._planes, record), s)
             word = dr.gather(mi.UInt32, self._corners, record * WORDS + region // PER_WORD)
             corners = word >> (8 * (region % PER_WORD))
             phi = self._mean(field, corners, s, lower, phi)
