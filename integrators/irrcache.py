@@ -238,10 +238,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     adjoint transport equation with the solver ``sweep``, for one medium in a box or sphere under
     distant and point emitters (not inside of it if delta-M applies), with ``max_depth`` 1, 2 or -1,
     no filter and no ``aovs``. There may be emission, surfaces, area emitters and several media if
-    ``max_depth`` is 2 or -1, and ``dr.backward`` is called; there are gradients by the reflectance
-    of ``diffuse`` BSDFs, too. In isotropic media without surfaces there are also gradients by
-    ``position`` of points and ``to_world`` of suns. All other gradients are refused with an error
-    that names the parameter.
+    ``max_depth`` is 2 or -1; there are gradients by the reflectance of ``diffuse`` BSDFs, too. In
+    isotropic media without surfaces there are also gradients by ``position`` of points and
+    ``to_world`` of suns (``dr.backward`` only). All other gradients are refused with an error that
+    names the parameter.
     While parameters carry gradients, the grid of the cache is kept. Images of the same state of the
     scene in one loss share one adjoint solve; ``cache_spp`` also sets its directions.
 

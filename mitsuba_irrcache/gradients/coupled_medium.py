@@ -21,7 +21,7 @@ from mitsuba_irrcache.cache.direct_light import DirectLight, spread
 from mitsuba_irrcache.cache.lookups import root_field
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.gradients.fluence import cached_components
-from mitsuba_irrcache.gradients.forward_peak import with_forward_peak
+from mitsuba_irrcache.gradients.forward_peak import changes_without_peak, with_forward_peak
 from mitsuba_irrcache.gradients.medium import (
     MARGIN,
     PAIRS,
@@ -38,6 +38,7 @@ from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, InScat
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
 from mitsuba_irrcache.gradients.scattering import Components, IsotropicScattering
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, VoxelSums
+from mitsuba_irrcache.gradients.tangent_fields import MediumChanges
 from mitsuba_irrcache.gradients.transport import AdjointTransport, TransportSettings
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.narrow_sources import Source, sources_of
@@ -269,6 +270,46 @@ class CoupledMedium:
         total = sum((a + b for _, a, b in contributions), mi.Spectrum(0))
         return [total] if self.basis is None else [total, *self.basis.moments(p, contributions)]
 
+    @property
+    def scattering_voxels(self) -> mi.UInt32:
+        """The voxels that scatter."""
+        pairs = zip(self.extinction, self.transport.albedo, strict=False)
+        return dr.compress(sum((s * a for s, a in pairs), mi.Float(0)) > 0)
+
+    def no_irradiance(self) -> list[list[Components]]:
+        """Return, for each channel and each part of the radiance, components of 0."""
+        scattering, voxels = self.transport.scattering, self.grid.voxel_count
+        found = [
+            [
+                [dr.opaque(mi.Float, 0, voxels) for _ in range(scattering.count)]
+                for _ in range(1 + len(scattering.sources))
+            ]
+            for _ in range(self.channels)
+        ]
+        dr.eval(found)
+        return found
+
+    def by_part(
+        self, p: mi.Point3f, contributions: list[tuple[mi.Vector3f, mi.Spectrum, mi.Spectrum]]
+    ) -> list[list[mi.Spectrum]]:
+        """Return the components of the irradiance at ``p`` for each part of the radiance, given
+        irradiance from directions, straight from emitters and scattered.
+        """
+        scattering = self.transport.scattering
+        parts = range(1 + len(scattering.sources))
+        found = [[mi.Spectrum(0)] * scattering.count for _ in parts]
+        for towards, emitted, scattered in contributions:
+            part = mi.UInt32(0)
+            for number, source in enumerate(scattering.sources, 1):
+                direction, cosine = source.seen_from(p)
+                part = dr.select(dr.dot(towards, direction) >= cosine, number, part)
+            basis = scattering.moments.basis(towards)
+            for number, components in enumerate(found):
+                own = dr.select(part == number, emitted, 0)
+                own = own + scattered if number == 0 else own
+                components[:] = [a + y * own for a, y in zip(components, basis, strict=True)]
+        return found
+
     def scattered(self, camera: list[Components]) -> AdjointFluence:
         """Return the adjoint fluence with all scattering within the box, given that of rays from
         outside.
@@ -339,6 +380,15 @@ class CoupledMedium:
             return found
         change = self._phases.forward if self._phases is not None else 0.0
         return with_forward_peak(self.medium, found, self._summed[SIGMA_T], self.wanted, change)
+
+    def remove_peak(self, changes: MediumChanges) -> None:
+        """Replace ``changes`` of the scene's medium by those of the medium as it is rendered."""
+        if self.medium.original is None:
+            return
+        fields = changes.fields
+        share = changes.g * self._phases.forward if self._phases is not None else 0.0
+        scaled = changes_without_peak(self.medium, fields.get(SIGMA_T), fields.get(ALBEDO), share)
+        fields |= dict(zip((SIGMA_T, ALBEDO), scaled, strict=True))
 
 
 def _index(sources: list[Source], source: Source) -> int:

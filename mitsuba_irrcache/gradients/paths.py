@@ -1,10 +1,8 @@
-"""Derivatives along paths through media with known fluence and between surfaces.
+"""Paths through media with known fluence and between surfaces, of which all segments are stored.
 
 A path starts at the camera, or in a voxel. It continues from surface to surface; on each segment
 the media add the radiance that they scatter, which their fluence determines, and attenuate what is
-behind. All segments of a path are stored. Derivatives are computed from its end to its start, so
-that the radiance from behind each segment is known (as in path replay backpropagation, Vicini,
-Speierer and Jakob 2021).
+behind. `path_derivatives` has the derivatives along the paths.
 """
 
 from __future__ import annotations
@@ -16,8 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.gradients.emitters import pull
-from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, RaySegments
+from mitsuba_irrcache.gradients.replay import CameraReplay, RaySegments
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     Media,
@@ -64,7 +61,7 @@ class Start:
 
 
 @dataclass
-class _Segment:
+class Segment:
     """A segment of paths: what it contributes, and what going back along it needs.
 
     Attributes:
@@ -112,7 +109,7 @@ class _Segment:
 
 
 @dataclass
-class _Vertex:
+class Vertex:
     """A surface at the end of a segment, or the start in a voxel (without ``incoming``).
 
     Attributes:
@@ -190,7 +187,7 @@ class MarchedMedia:
         offset: mi.Float,
         parts: list[tuple[list[CameraReplay], mi.Bool]],
     ) -> tuple[list[mi.Spectrum], list[mi.Spectrum], mi.Spectrum]:
-        """Return ``scattered``, ``before`` and ``through`` of `_Segment`."""
+        """Return ``scattered``, ``before`` and ``through`` of `Segment`."""
         one = mi.Spectrum(dr.ones(mi.Float, dr.width(offset)))
         scattered, transmittances = [], []
         for number, (near, far, hit) in enumerate(zip(*spans, strict=True)):
@@ -224,7 +221,7 @@ class MarchedMedia:
         return result
 
 
-class PathAdjoint:
+class TracedPaths:
     """Traces paths in ``scene`` between surfaces and through ``media``.
 
     ``emitters`` and ``surfaces`` state whether derivatives with respect to the radiance of emitters
@@ -247,8 +244,8 @@ class PathAdjoint:
         self._attenuating = None if events is None else media.without_scattering()
         #: the media for rays from voxels and diffuse surfaces
         self._indirect = media.indirect()
-        self._segments: list[_Segment] = []
-        self._vertices: list[_Vertex | None] = []
+        self._segments: list[Segment] = []
+        self._vertices: list[Vertex | None] = []
 
     # Forwards
 
@@ -325,13 +322,13 @@ class PathAdjoint:
         origin: mi.Interaction3f,
         adjoint: Callable[[mi.Vector3f], mi.Spectrum],
         rng: mi.PCG32,
-    ) -> tuple[_Vertex, mi.PCG32]:
+    ) -> tuple[Vertex, mi.PCG32]:
         sample = mi.Point2f(rng.next_float32(), rng.next_float32())
         record, emitter, shadow, visible = self._emitter(origin, sample, mi.Bool(True))
         other = dr.select(record.delta, 0, UNIFORM)
         share = power_heuristic_or_one(record, other)
         scale = adjoint(record.d) * (visible * share)
-        vertex = _Vertex(
+        vertex = Vertex(
             shadow, distance_to(record), scale * emitter, record, scale, origin, None, record.d,
             mi.Spectrum(1), mi.Bool(True),
         )  # fmt: skip
@@ -368,7 +365,7 @@ class PathAdjoint:
         alpha: mi.Float | None,
         parts: list[tuple[list[CameraReplay], mi.Bool]],
         skipped: list[mi.Bool],
-    ) -> _Segment:
+    ) -> Segment:
         """Follow rays to the next surface.
 
         ``weights`` are those of scattered radiance and of the radiance of emitters; ``skipped``
@@ -397,14 +394,14 @@ class PathAdjoint:
             away = active & ~end.is_valid()
             escaped = dr.select(away, through * (alpha / dr.size_v(mi.Spectrum)), 0)
         dr.eval(emitted, emitter_weight, escaped)
-        return _Segment(
+        return Segment(
             ray, distance, offset, weight, *spans, scattered, before, through, parts, end, emitted,
             emitter_weight, escaped,
         )  # fmt: skip
 
     def _scatter(
-        self, segment: _Segment, number: int, arrival: tuple, active: mi.Bool, rng: mi.PCG32
-    ) -> tuple[_Vertex, mi.Ray3f, mi.Spectrum, tuple, mi.Bool, mi.PCG32]:
+        self, segment: Segment, number: int, arrival: tuple, active: mi.Bool, rng: mi.PCG32
+    ) -> tuple[Vertex, mi.Ray3f, mi.Spectrum, tuple, mi.Bool, mi.PCG32]:
         """Scatter paths at the end of a segment.
 
         ``arrival`` is the position where the path last chose a direction, its density, whether the
@@ -447,7 +444,7 @@ class PathAdjoint:
             ratio = dr.max(dr.abs(weight)) / dr.select(first > 0, first, 1)
             chance = dr.clip(ratio, LEAST_CHANCE, 0.95)
         goes_on = rng.next_float32() < chance
-        vertex = _Vertex(
+        vertex = Vertex(
             shadow, distance_to(record), scale * emitter * value, record, scale * value,
             mi.Interaction3f(si), si, towards, value, active, found.wo, scattering,
         )  # fmt: skip
@@ -476,93 +473,6 @@ class PathAdjoint:
         for vertex in self._vertices:
             total += 0 if vertex is None else dr.abs(vertex.direct)
         return float(dr.max(dr.max(total))[0])
-
-    # Back
-
-    def add(self, splats: list[CameraSplats], without_first: int | None = None) -> None:
-        """Go back along the paths that `trace` stored, and add derivatives to ``splats``.
-
-        ``without_first`` is a medium that the first segments skip.
-        """
-        rest = mi.Spectrum(0)
-        for number in range(len(self._segments) - 1, -1, -1):
-            segment, vertex = self._segments[number], self._vertices[number + 1]
-            self._add_vertex(vertex, rest, splats)
-            rest = rest + vertex.direct
-            skipped = without_first if number == 0 else None
-            self._add_segment(segment, rest, splats, skipped)
-            rest = rest + segment.gathered() + segment.emitted + segment.escaped
-            dr.eval(rest)
-        if self._vertices[0] is not None:
-            self._add_vertex(self._vertices[0], mi.Spectrum(0), splats)
-
-    def _add_segment(
-        self,
-        segment: _Segment,
-        rest: mi.Spectrum,
-        splats: list[CameraSplats],
-        skipped: int | None,
-    ) -> None:
-        behind = rest + segment.emitted + segment.escaped
-        for number in range(len(self._media.marches)):
-            if number == skipped:
-                continue
-            passed = segment.weight * segment.before[number]
-            near, far, hit = segment.near[number], segment.far[number], segment.hit[number]
-            ahead = segment.behind(number) + behind
-            for marches, mask in segment.parts:
-                march, own = marches[number], splats[number]
-                rays = RaySegments(segment.ray, near, far, passed, segment.offset, hit & mask)
-                if march.irradiance is None:  # nothing is scattered, so that nothing collides
-                    own = CameraSplats(own.sigma_t, None, None, own.emission)
-                march.replay(rays, ahead, mi.Spectrum(0), own)
-        dr.eval()
-        if self._emitters:
-            with dr.resume_grad():
-                value = segment.end.emitter(self._scene).eval(segment.end)
-                pull(value, segment.emitter_weight)
-
-    def _add_vertex(self, vertex: _Vertex, rest: mi.Spectrum, splats: list[CameraSplats]) -> None:
-        """Add derivatives through the direct radiance of emitters, and with respect to the BSDF.
-
-        ``rest`` is the weighted radiance of all further segments.
-        """
-        none = mi.Spectrum(dr.zeros(mi.Float, dr.width(vertex.length)))
-        offset = dr.ones(mi.Float, dr.width(vertex.length))
-        lit = vertex.active & (dr.max(dr.abs(vertex.direct)) > 0)
-        spans = self._media.spans(vertex.shadow, vertex.length, lit)
-        for march, near, far, hit, own in zip(self._media.marches, *spans, splats, strict=True):
-            if own.sigma_t is not None:
-                rays = RaySegments(vertex.shadow, near, far, none, offset, hit)
-                attenuation = CameraSplats(own.sigma_t, None, None)
-                march.replay(rays, vertex.direct + none, none, attenuation)
-        dr.eval()
-        if self._emitters:
-            record = vertex.record
-            sampled = vertex.active & (record.pdf > 0)
-            with dr.resume_grad():
-                value = self._scene.eval_emitter_direction(vertex.origin, record, sampled)
-                pull(
-                    value / dr.select(record.pdf > 0, record.pdf, 1),
-                    dr.select(sampled, vertex.emitter_weight, 0),
-                )
-        if self._surfaces and vertex.surface is not None:
-            self._add_surface(vertex, rest, lit)
-
-    def _add_surface(self, vertex: _Vertex, rest: mi.Spectrum, lit: mi.Bool) -> None:
-        context, si = mi.BSDFContext(), vertex.surface
-
-        def share(value: mi.Spectrum, factor: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
-            return dr.select(active & (factor != 0), value / dr.select(factor != 0, factor, 1), 0)
-
-        pairs = (
-            (vertex.towards, share(vertex.direct, vertex.direct_scattering, lit)),
-            (vertex.next_direction, share(rest, vertex.scattering, vertex.active)),
-        )
-        for direction, adjoint in pairs:
-            dr.eval(adjoint)
-            with dr.resume_grad():
-                pull(si.bsdf().eval(context, si, direction, vertex.active), adjoint)
 
 
 def power_heuristic_or_one(record: mi.DirectionSample3f, other: mi.Float) -> mi.Float:

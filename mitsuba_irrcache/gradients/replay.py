@@ -81,6 +81,14 @@ class CameraSplats:
         self.sigma_t, self.albedo, self.emission = sigma_t, albedo, emission
         self.collisions, self.unscattered, self.g = collisions, unscattered, g
 
+    def without_scattering(self) -> CameraSplats:
+        """Return the sums for rays into which the medium scatters nothing."""
+        return CameraSplats(self.sigma_t, None, None, self.emission)
+
+    def attenuation(self) -> CameraSplats:
+        """Return the sums for radiance that the medium only attenuates."""
+        return CameraSplats(self.sigma_t, None, None)
+
 
 class InScattering:
     """Anisotropic scattering into camera rays.

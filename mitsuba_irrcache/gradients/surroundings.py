@@ -1,17 +1,11 @@
-"""Derivatives in scenes with surfaces, area emitters and several media.
-
-Two operators couple a medium with itself. Radiance that stays in its box is scattered by discrete
-ordinates, whose adjoint is `AdjointTransport`. Radiance that leaves it, and returns from surfaces
-or is scattered in another medium, is sampled by paths from its voxels (`PathAdjoint`). When the
-adjoint fluence of all media is known, paths from the voxels also have the derivatives of the
-radiance that arrives there.
-"""
+"""Media among surfaces and other media, and the paths that couple them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.core.sequences import (
@@ -20,37 +14,33 @@ from mitsuba_irrcache.core.sequences import (
     random_stream,
     unit_floats,
 )
-from mitsuba_irrcache.gradients.coupled_medium import AdjointFluence, CoupledMedium, Importance
-from mitsuba_irrcache.gradients.film import FilmAdjoint
-from mitsuba_irrcache.gradients.paths import MarchedMedia, PathAdjoint, Start
-from mitsuba_irrcache.gradients.replay import CameraSplats
-from mitsuba_irrcache.gradients.scattering import Components
+from mitsuba_irrcache.gradients.coupled_medium import CoupledMedium
+from mitsuba_irrcache.gradients.path_derivatives import PathDerivatives
+from mitsuba_irrcache.gradients.paths import MarchedMedia, Start
 
-#: Maximum number of paths of a launch; maximum number of paths from voxels for derivatives through
-#: the irradiance from the surroundings; maximum number for each exchange with the surroundings;
-#: number of directions by which the fluence of voxels without a cached value is estimated.
-LANES, RAYS, EXCHANGED, DIRECTIONS = 1 << 17, 1 << 20, 1 << 18, 64
-#: Number of paths from voxels for each camera sample, so that they add a tenth to its noise, at
-#: least `FEWEST` in all, half as many for an exchange.
-PATHS_PER_SAMPLE, FEWEST = 2, 1 << 16
-#: Largest change of the adjoint fluence by a further exchange, relative to the whole; and number of
-#: exchanges, at most.
+#: Maximum number of paths of a launch; number of directions by which the fluence of voxels without
+#: a cached value is estimated.
+LANES, DIRECTIONS = 1 << 17, 64
+#: Largest change by a further exchange of radiance, relative to the whole; and number of exchanges,
+#: at most.
 TOLERANCE, MOST_EXCHANGES = 3e-3, 32
 #: Uses of random numbers: camera rays, exchanges, derivatives, fluence of voxels without a cache.
 CAMERA, EXCHANGE, DERIVATIVES, UNCACHED = range(4)
 
 
 class Surroundings:
-    """Derivatives of objectives of images of a scene with respect to its media, through paths.
+    """Media among surfaces and other media, and paths between them.
 
     Args:
         scene: the scene.
         media: the media that have a cache: all of the scene.
         hide_emitters: the integrator's property.
-        kinds: whether derivatives with respect to emitters, and to BSDFs, are added to the
-            gradients of their parameters.
+        kinds: whether there are derivatives with respect to emitters, and to BSDFs.
         seed: of random numbers.
     """
+
+    #: paths with derivatives in the mode of the subclass
+    paths: type[PathDerivatives]
 
     def __init__(
         self,
@@ -62,15 +52,15 @@ class Surroundings:
     ) -> None:
         self._scene, self.media, self._hides = scene, media, hide_emitters
         self._kinds, self._seed = kinds, seed
-        self._views, self._samples = 0, 0  # views so far, and their camera samples
+        self._views = 0  # so far
         for number, medium in enumerate(media):
             self._complete(number, medium)
 
-    def _paths(self, derivatives: bool = True, from_camera: bool = False) -> PathAdjoint:
+    def _new_paths(self, derivatives: bool = True, from_camera: bool = False) -> PathDerivatives:
         marched = MarchedMedia([medium.march for medium in self.media])
         kinds = self._kinds if derivatives else (False, False)
         events = int(from_camera) if self.media[0].single else None
-        return PathAdjoint(self._scene, marched, *kinds, self._hides, events)
+        return self.paths(self._scene, marched, *kinds, self._hides, events)
 
     def _random(self, use: int, number: int, count: int, view: int = 0) -> mi.PCG32:
         lanes = dr.arange(mi.UInt32, count)
@@ -78,30 +68,41 @@ class Surroundings:
         word = mi.sample_tea_32(word, dr.opaque(mi.UInt32, view))[0]
         return random_stream(mi.sample_tea_32(lanes, word))
 
+    def _starts(
+        self, medium: CoupledMedium, voxels: mi.UInt32, directions: int, use: int, centred: bool
+    ) -> Iterator[tuple[mi.UInt32, Start]]:
+        """Yield voxels, and paths from each of them in this number of ``directions``.
+
+        The mean of what the paths of a voxel contribute is the irradiance in it. ``use`` determines
+        random numbers; ``centred`` paths start at the centres of the voxels.
+        """
+        per_launch, grid = max(1, LANES // directions), medium.grid
+        for first in range(0, dr.width(voxels), per_launch):
+            count = min(per_launch, dr.width(voxels) - first)
+            place = dr.arange(mi.UInt32, count * directions)
+            own = dr.gather(mi.UInt32, voxels, dr.arange(mi.UInt32, count) + first)
+            voxel = dr.gather(mi.UInt32, own, place // directions)
+            rng = self._random(use, first, count * directions)
+            shift = [rng.next_uint32(), rng.next_uint32()]
+            shift = [dr.gather(mi.UInt32, s, place // directions) for s in shift]
+            u, v = unit_floats(kronecker_words(place % directions, shift))
+            direction = mi.warp.square_to_uniform_sphere(mi.Point2f(u, v))
+            origin = grid.centers(voxel)
+            if not centred:
+                within = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+                origin = grid.world.point(mi.Point3f(*grid.voxel_indices(voxel)) + within)
+            one = mi.Spectrum(dr.ones(mi.Float, count * directions))
+            dr.eval(own, origin, direction, rng)
+            ray = mi.Ray3f(origin, direction)
+            yield own, Start(ray, one * (4 * dr.pi), None, lambda _, one=one: one, rng)
+
     def _complete(self, number: int, medium: CoupledMedium) -> None:
         """Estimate the fluence of voxels for which there is no cached one."""
-        unknown = medium.unknown
-        per_launch = max(1, LANES // DIRECTIONS)
-        found: list[list[mi.Spectrum]] = []
-        for first in range(0, dr.width(unknown), per_launch):
-            count = min(per_launch, dr.width(unknown) - first)
-            place = dr.arange(mi.UInt32, count * DIRECTIONS)
-            voxel = dr.gather(mi.UInt32, unknown, place // DIRECTIONS + first)
-            rng = self._random(UNCACHED + number, first, count * DIRECTIONS)
-            shift = [rng.next_uint32(), rng.next_uint32()]
-            shift = [dr.gather(mi.UInt32, s, place // DIRECTIONS) for s in shift]
-            u, v = unit_floats(kronecker_words(place % DIRECTIONS, shift))
-            direction = mi.warp.square_to_uniform_sphere(mi.Point2f(u, v))
-            ray = mi.Ray3f(medium.grid.centers(voxel), direction)
-            one = mi.Spectrum(dr.ones(mi.Float, count * DIRECTIONS))
-            start = Start(ray, one * (4 * dr.pi), None, lambda _, one=one: one, rng)
-            paths = self._paths(derivatives=False)
+        unknown, found = medium.unknown, []
+        for _, start in self._starts(medium, unknown, DIRECTIONS, UNCACHED + number, centred=True):
+            paths = self._new_paths(derivatives=False)
             paths.trace(start)
-            sums = [
-                mi.Spectrum(*(dr.block_sum(v, DIRECTIONS) * (1 / DIRECTIONS) for v in component))
-                for component in medium.moments(ray.o, paths.contributions())
-            ]
-            dr.eval(sums)
+            sums = means(medium.moments(start.ray.o, paths.contributions()), DIRECTIONS)
             found.append(sums)
         if dr.width(unknown):
             components = list(zip(*found, strict=True))
@@ -111,159 +112,21 @@ class Surroundings:
             ]
             medium.complete(unknown, values)
 
-    # Views
 
-    def view(self, film: FilmAdjoint) -> tuple[list[CameraSplats], list[list[Components]]]:
-        """Return the sums of derivatives at a fixed fluence, and the components of the adjoint
-        fluence of camera rays for each medium and channel.
-        """
-        self._views += 1
-        self._samples += film.samples
-        splats = None
-        sees = self._scene.environment() is not None and not self._hides
-        for number, each in enumerate(film.passes()):
-            count = dr.width(each.ray.d)
-            alpha = None if sees or each.alpha is None else -each.alpha
-            rng = self._random(CAMERA, number, count, self._views)
-            paths = self._paths(from_camera=True)
-            camera = mi.Ray3f(each.ray), each.radiance, alpha, None, rng
-            paths.trace(Start(*camera, medium=film.medium))
-            if splats is None:
-                splats = self._splats(paths, film.samples, collisions=True)
-            paths.add(splats)
-            dr.eval()
-        return splats, [
-            medium.mean(own.collisions) for medium, own in zip(self.media, splats, strict=True)
-        ]
-
-    def _splats(
-        self, paths: PathAdjoint, count: float, collisions: bool = False, derivatives: bool = True
-    ) -> list[CameraSplats]:
-        largest = max(paths.largest(), 1e-30)
-        return [m.splats(largest, count, collisions, derivatives) for m in self.media]
-
-    # Transport
-
-    def transported(self, camera: list[list[Components]]) -> list[CameraSplats]:
-        """Return the sums of derivatives through the fluence, given the components of the adjoint
-        fluence of camera rays for each medium and channel.
-        """
-        # docs/primer, eq. (8.19)
-        splats = None
-        for number, importance in enumerate(self._importances(self._solved(camera))):
-            for first, rays in self._launches(DERIVATIVES):
-                start = self._from_voxels(number, importance, DERIVATIVES, first, rays)
-                if start is None:
-                    continue
-                paths = self._paths()
-                paths.trace(start)
-                if splats is None:
-                    splats = self._splats(paths, self._count(DERIVATIVES))
-                paths.add(splats)
-                dr.eval()
-        return splats or [m.splats(1e-30, 1, False, True) for m in self.media]
-
-    def _importances(self, adjoint: list[AdjointFluence]) -> list[Importance]:
-        return [m.importance(own) for m, own in zip(self.media, adjoint, strict=True)]
-
-    def _count(self, use: int) -> int:
-        """Return the number of paths from the voxels of all media for a ``use``.
-
-        It is a power of two: kernels, which depend on it, are reused.
-        """
-        count = max(PATHS_PER_SAMPLE * self._samples, FEWEST)
-        count = min(1 << int(np.ceil(np.log2(count))), RAYS)
-        return count if use == DERIVATIVES else min(count // 2, EXCHANGED)
-
-    def _total(self, use: int) -> int:
-        """Return the number of paths from the voxels of each medium."""
-        return max(self._count(use) // len(self.media), 1)
-
-    def _launches(self, use: int) -> list[tuple[int, int]]:
-        """Return the first path and the number of paths of each launch for a medium."""
-        total = self._total(use)
-        return [(first, min(LANES, total - first)) for first in range(0, total, LANES)]
-
-    def _solved(self, camera: list[list[Components]]) -> list[AdjointFluence]:
-        """Return the adjoint fluence of all media with all exchanges between them and surfaces."""
-        # docs/primer, eq. (8.20)
-        total = [m.scattered(own) for m, own in zip(self.media, camera, strict=True)]
-        if self.media[0].single:
-            return total
-        change = self._importances(total)
-        scale = _norm(change)
-        for number in range(MOST_EXCHANGES):
-            returned = self._exchanged(change, number)
-            entering = [m.entering(own) for m, own in zip(self.media, returned, strict=True)]
-            if _norm(self._importances(entering)) <= TOLERANCE * scale:
-                return total
-            further = [m.scattered(own) for m, own in zip(self.media, returned, strict=True)]
-            total = [a + b for a, b in zip(total, further, strict=True)]
-            dr.eval([[own.camera, own.travelled] for own in total])
-            change = self._importances(further)
-        mi.Log(
-            mi.LogLevel.Warn,
-            "irrcache: derivatives through the exchange of radiance between media and surfaces "
-            f"have not converged after {MOST_EXCHANGES} exchanges.",
-        )
-        return total
-
-    def _exchanged(self, importances: list[Importance], exchange: int) -> list[list[Components]]:
-        """Return the components of the adjoint fluence that collides after it has left its medium,
-        for each medium and channel.
-        """
-        splats = None
-        for number, importance in enumerate(importances):
-            for first, rays in self._launches(EXCHANGE):
-                use = EXCHANGE | exchange << 4
-                start = self._from_voxels(number, importance, use, first, rays)
-                if start is None:
-                    continue
-                paths = self._paths(derivatives=False)
-                paths.trace(start)
-                if splats is None:
-                    splats = self._splats(paths, self._count(EXCHANGE), True, False)
-                paths.add(splats, without_first=number)
-        if splats is None:
-            splats = [m.splats(1e-30, 1, True, False) for m in self.media]
-        return [m.mean(own.collisions) for m, own in zip(self.media, splats, strict=True)]
-
-    def _from_voxels(
-        self, number: int, importance: Importance, use: int, first: int, rays: int
-    ) -> Start | None:
-        """Return paths from voxels of a medium, sampled in proportion to what radiance is worth
-        there; None if it is worth nothing.
-        """
-        grid, magnitude = self.media[number].grid, importance.magnitude
-        total = float(dr.sum(magnitude)[0])
-        if not 0 < total < np.inf:
-            return None
-        rng = self._random(use, (first // LANES << 4) + number, rays)
-        count = self._total(use)
-        place = dr.arange(mi.UInt32, rays) + first
-        u = (mi.Float(place) + rng.next_float32()) / count
-        voxel, chance = mi.DiscreteDistribution(magnitude).sample_pmf(dr.minimum(u, 0.9999999))
-        shift = hashed_seed((self._seed & 0xFFFFFFFF, use))
-        s, t = unit_floats(kronecker_words(place, shift))
-        within = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-        origin = grid.world.point(mi.Point3f(*grid.voxel_indices(voxel)) + within)
-        direction = mi.warp.square_to_uniform_sphere(mi.Point2f(s, t))
-        # Rounding of the cumulative sum can select a voxel of no worth: 0 / 0.
-        share = dr.select(chance > 0, dr.rcp(chance * count), 0)
-        dr.eval(voxel, origin, direction, share, rng)
-        ray, solid_angle = mi.Ray3f(origin, direction), 4 * dr.pi
-
-        def of_emitters(towards: mi.Vector3f) -> mi.Spectrum:
-            return importance.of_emitters(voxel, origin, towards) * share
-
-        scattered = importance.of(voxel, direction) * (share * solid_angle)
-        emitted = of_emitters(direction) * solid_angle
-        dr.eval(scattered, emitted)
-        return Start(ray, scattered, None, of_emitters, rng, emitted)
+def means(components: list[mi.Spectrum], count: int) -> list[mi.Spectrum]:
+    """Return the means over each ``count`` consecutive values of ``components``."""
+    found = [
+        mi.Spectrum(*(dr.block_sum(v, count) * (1 / count) for v in component))
+        for component in components
+    ]
+    dr.eval(found)
+    return found
 
 
-def _norm(importances: list[Importance]) -> float:
-    """Return the sum of the magnitudes of what radiance is worth in all voxels."""
-    sums = [dr.sum(importance.magnitude) for importance in importances]
-    dr.eval(sums)
-    return sum(float(each[0]) for each in sums)
+def warn_of_exchanges() -> None:
+    """Log a warning that the exchanges have not converged."""
+    mi.Log(
+        mi.LogLevel.Warn,
+        "irrcache: derivatives through the exchange of radiance between media and surfaces "
+        f"have not converged after {MOST_EXCHANGES} exchanges.",
+    )

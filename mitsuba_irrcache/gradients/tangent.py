@@ -14,12 +14,7 @@ from mitsuba_irrcache.gradients.medium import MediumAdjoint, field_of, original_
 from mitsuba_irrcache.gradients.parameters import ALBEDO, EMISSION, SIGMA_T
 from mitsuba_irrcache.gradients.points import add_paths_to_light
 from mitsuba_irrcache.gradients.replay import RaySegments
-from mitsuba_irrcache.gradients.tangent_fields import (
-    CameraReaders,
-    ChangesOfVoxels,
-    FieldReader,
-    VoxelReader,
-)
+from mitsuba_irrcache.gradients.tangent_fields import ChangesOfVoxels, FieldReader, MediumChanges
 from mitsuba_irrcache.gradients.tangent_transport import FluenceTangent, VoxelTangents
 from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
 
@@ -130,17 +125,9 @@ class ImageTangent:
         self, segments: RaySegments, ahead: mi.Spectrum, unscattered: mi.Spectrum
     ) -> mi.Spectrum:
         """Return the sum of all changes along rays, see `CameraReplay.replay`."""
-        zero = mi.Spectrum(dr.zeros(mi.Float, dr.width(segments.near)))
-        readers = CameraReaders()
-        for role in (SIGMA_T, ALBEDO, EMISSION):
-            if role in self._fields:
-                setattr(readers, role, FieldReader(mi.Spectrum(zero), self._fields[role]))
-        if self._collisions is not None:
-            readers.collisions = VoxelReader(mi.Spectrum(zero), self._collisions)
-        if self._adjoint.is_scaled and self._original is not None:
-            readers.unscattered = FieldReader(mi.Spectrum(zero), self._original)
-        if self._g:
-            readers.g = FieldReader(mi.Spectrum(zero), ConstantField(np.array([self._g])))
+        original = self._original if self._adjoint.is_scaled else None
+        changes = MediumChanges(self._fields, self._g, self._collisions, original)
+        readers = changes.readers(dr.width(segments.near))
         readers = self._adjoint.march.replay(segments, ahead, unscattered, readers)
         total = readers.total()
         dr.eval(total)

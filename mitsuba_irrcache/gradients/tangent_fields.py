@@ -6,14 +6,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.core.fast_math import clipped
 from mitsuba_irrcache.core.spectrum import interleaved
+from mitsuba_irrcache.gradients.parameters import ALBEDO, EMISSION, SIGMA_T
 from mitsuba_irrcache.gradients.scattering import Components
-from mitsuba_irrcache.grids.fields import Field
+from mitsuba_irrcache.grids.fields import ConstantField, Field
 from mitsuba_irrcache.grids.grid import Grid
 
 
@@ -72,6 +75,85 @@ class VoxelReader:
             self.total[number // self.field.components] += change
 
 
+@dataclass(eq=False)
+class MediumChanges:
+    """Changes of a medium and of its fluence along a change of the parameters.
+
+    Attributes:
+        fields: changes of the fields of the medium as it is rendered, by role.
+        g: change of the mean cosine of the phase function.
+        collisions: changes of what camera rays that collide in the voxels read; None for none.
+        original: change of the extinction before delta-M scaling, which attenuates narrow sources
+            behind the medium; None for none.
+    """
+
+    fields: dict[str, Field]
+    g: float = 0.0
+    collisions: ChangesOfVoxels | None = None
+    original: Field | None = None
+
+    @property
+    def sigma_t(self) -> Field | None:
+        """The change of the extinction."""
+        return self.fields.get(SIGMA_T)
+
+    def without_scattering(self) -> MediumChanges:
+        """Return the changes for rays into which the medium scatters nothing."""
+        own = {role: field for role, field in self.fields.items() if role != ALBEDO}
+        return MediumChanges(own)
+
+    def attenuation(self) -> MediumChanges:
+        """Return the changes for radiance that the medium only attenuates."""
+        return MediumChanges({SIGMA_T: self.sigma_t} if self.sigma_t is not None else {})
+
+    def readers(self, width: int) -> CameraReaders:
+        """Return sums for ``width`` rays, 0 at first, of the products with these changes."""
+        zero = mi.Spectrum(dr.zeros(mi.Float, width))
+        readers = CameraReaders()
+        for role in (SIGMA_T, ALBEDO, EMISSION):
+            if role in self.fields:
+                setattr(readers, role, FieldReader(mi.Spectrum(zero), self.fields[role]))
+        if self.collisions is not None:
+            readers.collisions = VoxelReader(mi.Spectrum(zero), self.collisions)
+        if self.original is not None:
+            readers.unscattered = FieldReader(mi.Spectrum(zero), self.original)
+        if self.g:
+            readers.g = FieldReader(mi.Spectrum(zero), ConstantField(np.array([self.g])))
+        return readers
+
+
+class AttachedParameters:
+    """Parameters of emitters and BSDFs in Dr.Jit's graph, and ``changes`` of them."""
+
+    def __init__(self, parameters: Sequence[object], changes: Sequence[object]) -> None:
+        self._pairs = list(zip(parameters, changes, strict=True))
+
+    def change_of(self, value: mi.Spectrum) -> mi.Spectrum:
+        """Return the change of a ``value`` that depends on the parameters."""
+        if not dr.grad_enabled(value):
+            return mi.Spectrum(0)
+        self._set(1)
+        found = mi.Spectrum(dr.forward_to(value, flags=dr.ADFlag.ClearNone))
+        dr.eval(found)
+        # Plugins keep variables that depend on the parameters, such as the padded texels of a
+        # texture, in which the gradients of further evaluations would add up.
+        self._set(-1)
+        dr.forward_to(value, flags=dr.ADFlag.ClearNone)
+        self._set(1)
+        return found
+
+    def _set(self, sign: int) -> None:
+        for parameter, change in self._pairs:
+            dr.set_grad(parameter, change * sign)
+
+
+class SceneChanges(NamedTuple):
+    """Changes of the ``media`` of a scene, and of its emitters and BSDFs."""
+
+    media: list[MediumChanges]
+    attached: AttachedParameters
+
+
 @dataclass
 class CameraReaders:
     """Products that the replay of camera rays adds up; attributes as those of `CameraSplats`."""
@@ -87,3 +169,8 @@ class CameraReaders:
         """Return the sum of all products."""
         found = vars(self).values()
         return sum((reader.total for reader in found if reader is not None), mi.Spectrum(0))
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to read."""
+        return all(reader is None for reader in vars(self).values())

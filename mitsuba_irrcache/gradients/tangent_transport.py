@@ -43,6 +43,56 @@ class VoxelTangents:
     incoming: np.ndarray | None = None
 
 
+def propagated(transport: AdjointTransport, first: list[list[Components]]) -> list[Components]:
+    """Return what the importance of camera rays that collide in a voxel is multiplied by.
+
+    ``first`` are, by channel, the components of the change of the fluence of collisions before
+    further scattering between voxels, for each part of the radiance. The results are those of
+    `FluenceTangent.for_camera`.
+    """
+    # docs/primer, eq. (8.18)
+    found: list = [None] * transport.channels
+    for level, own in transport.levels:
+        travelled = _scattered_on(transport, level, [first[c] for c in own])
+        for c, components in zip(own, travelled, strict=True):
+            found[c] = _weighted(transport, c, first[c], components)
+    dr.eval(found)
+    return found
+
+
+def _weighted(
+    transport: AdjointTransport, channel: int, parts: list[Components], travelled: Components
+) -> Components:
+    scattering = transport.scattering
+    smooth = [a + b for a, b in zip(parts[0], travelled, strict=True)]
+    for source, own in zip(scattering.sources, parts[1:], strict=True):
+        if not source.sharp:  # its higher moments are part of those that camera rays read
+            smooth[1:] = [a + b for a, b in zip(smooth[1:], own[1:], strict=True)]
+    factors = scattering.product_factors()
+    values = [f * v for f, v in zip(factors, smooth, strict=True)]
+    values += [own[0] * dr.inv_four_pi for own in parts[1:]]
+    return [value * transport.albedo[channel] for value in values]
+
+
+def _scattered_on(
+    transport: AdjointTransport, level: MultigridLevel, parts: list[list[Components]]
+) -> list[Components]:
+    """Return what further scattering between voxels adds to the first change, by channel."""
+    scattering = transport.scattering
+    if transport.single:
+        zero = dr.zeros(mi.Float, transport.grid.voxel_count)
+        return [[zero] * scattering.count for _ in parts]
+    totals = [[sum(each) for each in zip(*own, strict=True)] for own in parts]
+    first = scattering.joined(totals)
+    dr.eval(first)
+    table = level.tracks.table(*transport.ordinates.scattering().without_incoming())
+    once = level.sweep(first, table)[1]
+    again = level.sweep(once, level.tracks.table(*transport.solving))[1]
+    phi = once + level.solve(again, transport.solving)
+    dr.eval(phi)
+    return scattering.separated(phi, len(parts))
+
+
 class FluenceTangent:
     """The derivative of the fluence of ``transport`` along ``tangents`` of its voxels.
 
@@ -67,40 +117,12 @@ class FluenceTangent:
         into the rays: the transpose of the adjoint fluence of camera rays, without the volume and
         the extinction of the voxels.
         """
-        # docs/primer, eq. (8.18)
-        transport, found = self._transport, [None] * self._transport.channels
+        transport = self._transport
+        found: list = [None] * transport.channels
         for level, own in transport.levels:
-            parts = {c: self._first(level, c) for c in own}
-            travelled = self._scattered_on(level, own, parts)
-            for c, components in zip(own, travelled, strict=True):
-                found[c] = self._weighted(c, parts[c], components)
-        dr.eval(found)
-        return found
-
-    def _weighted(self, channel: int, parts: list[Components], travelled: Components) -> Components:
-        factors = self._transport.scattering.product_factors()
-        first = [a + b for a, b in zip(parts[0], travelled, strict=True)]
-        values = [f * v for f, v in zip(factors, first, strict=True)]
-        values += [own[0] * dr.inv_four_pi for own in parts[1:]]
-        return [value * self._transport.albedo[channel] for value in values]
-
-    def _scattered_on(
-        self, level: MultigridLevel, own: tuple[int, ...], parts: dict[int, list[Components]]
-    ) -> list[Components]:
-        """Return what further scattering between voxels adds to the first change, by channel."""
-        transport, scattering = self._transport, self._transport.scattering
-        if transport.single:
-            zero = dr.zeros(mi.Float, transport.grid.voxel_count)
-            return [[zero] * scattering.count for _ in own]
-        totals = [[sum(each) for each in zip(*parts[c], strict=True)] for c in own]
-        first = scattering.joined(totals)
-        dr.eval(first)
-        table = level.tracks.table(*transport.ordinates.scattering().without_incoming())
-        once = level.sweep(first, table)[1]
-        again = level.sweep(once, level.tracks.table(*transport.solving))[1]
-        phi = once + level.solve(again, transport.solving)
-        dr.eval(phi)
-        return scattering.separated(phi, len(own))
+            for channel in own:
+                found[channel] = self._first(level, channel)
+        return propagated(transport, found)
 
     def _first(self, level: MultigridLevel, channel: int) -> list[Components]:
         """Return the change before further scattering, for each part of the radiance.

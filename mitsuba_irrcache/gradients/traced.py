@@ -34,7 +34,15 @@ from mitsuba_irrcache.gradients.parameters import (
 )
 from mitsuba_irrcache.gradients.replay import CameraSplats
 from mitsuba_irrcache.gradients.scattering import split
-from mitsuba_irrcache.gradients.surroundings import LANES, Surroundings
+from mitsuba_irrcache.gradients.surroundings import LANES
+from mitsuba_irrcache.gradients.surroundings_adjoint import SurroundingsAdjoint
+from mitsuba_irrcache.gradients.surroundings_tangent import SurroundingsTangent
+from mitsuba_irrcache.gradients.tangent import changed_field
+from mitsuba_irrcache.gradients.tangent_fields import (
+    AttachedParameters,
+    MediumChanges,
+    SceneChanges,
+)
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind
 from mitsuba_irrcache.lights.falloff import lies_in
 from mitsuba_irrcache.lights.narrow_sources import MAX_LAMPS
@@ -142,16 +150,32 @@ class TracedAdjoint:
             start += count
         return self._by_parameters(self._surroundings.transported(camera))
 
-    def along(self, changes: Mapping[str, object]) -> None:
-        """Refuse forward mode."""
-        refuse_all(
-            list(changes),
-            "dr.forward was called, and there are surfaces, area lights, several media or emission",
-            "Call dr.backward on a loss",
+    def along(self, changes: Mapping[str, object]) -> SurroundingsTangent:
+        """Return the derivatives of images along ``changes`` of the parameters, by key."""
+        media, *others = self._arguments()
+        found = [MediumChanges({}) for _ in media]
+        for key, role in self._roles.items():
+            if not isinstance(role, tuple):
+                continue
+            (number, name), value, change = role, self._params[key], changes[key]
+            if name == MEAN_COSINE:
+                found[number].g = float(np.array(change).ravel()[0])
+            else:
+                found[number].fields[name] = changed_field(value, change, media[number], name)
+        for medium, own in zip(media, found, strict=True):
+            medium.remove_peak(own)
+        attached = [key for key, role in self._roles.items() if not isinstance(role, tuple)]
+        own = AttachedParameters(
+            [self._params[k] for k in attached], [changes[k] for k in attached]
         )
+        return SurroundingsTangent(self._scene, media, *others, SceneChanges(found, own))
 
     @cached_property
-    def _surroundings(self) -> Surroundings:
+    def _surroundings(self) -> SurroundingsAdjoint:
+        return SurroundingsAdjoint(self._scene, *self._arguments())
+
+    def _arguments(self) -> tuple[list[CoupledMedium], bool, tuple[bool, bool], int]:
+        """Return the arguments of `Surroundings` after the scene."""
         wanted: list[dict[str, int]] = [{} for _ in self._parts]
         for key, role in self._roles.items():
             if isinstance(role, tuple):
@@ -168,7 +192,7 @@ class TracedAdjoint:
         ]
         users = [user for role in self._roles.values() for user in users_of(role)]
         kinds = tuple(any(isinstance(u, kind) for u in users) for kind in (mi.Emitter, mi.BSDF))
-        return Surroundings(self._scene, media, self._hides, kinds, self._seed)
+        return media, self._hides, kinds, self._seed
 
     def _by_parameters(self, splats: list[CameraSplats]) -> dict[str, object]:
         media = self._surroundings.media

@@ -7,7 +7,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.validation.gradients.cases import CASES, Case
+from experiments.validation.gradients.cases import (
+    CASES,
+    SKY,
+    SUN,
+    SURROUNDED,
+    Case,
+    ground,
+    lamp,
+    second_medium,
+)
 from experiments.validation.gradients.differences import (
     compare,
     derivatives,
@@ -17,6 +26,7 @@ from experiments.validation.gradients.differences import (
     pixel_weights,
 )
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.gradients import surroundings_adjoint, surroundings_tangent
 from tests.support.slow import with_slow
 
 #: Largest relative difference between the derivatives of both modes: both discretise the same
@@ -25,7 +35,7 @@ DIFFERENCE = 0.01
 PERTURBATIONS = 3
 
 
-def check(case: Case, difference: float = DIFFERENCE) -> None:
+def check(case: Case, difference: float = DIFFERENCE, perturbations: int = PERTURBATIONS) -> None:
     """The derivative along perturbations of each parameter is that by reverse mode (dot test)."""
     scene = case.load()
     weights = pixel_weights(scene)
@@ -33,7 +43,7 @@ def check(case: Case, difference: float = DIFFERENCE) -> None:
     for name, gradient in reverse.items():
         params = mi.traverse(scene)
         value = np.array(params[first_key(params, name)], dtype=np.float64)
-        steps = directions(case, name, value, PERTURBATIONS)
+        steps = directions(case, name, value, perturbations)
         forward = derivatives(scene, name, weights, steps)
         expected = [(gradient.reshape(value.shape) * step).sum() for step in steps]
         assert np.linalg.norm(forward - expected) < difference * np.linalg.norm(expected), name
@@ -63,6 +73,133 @@ def test_both_modes_agree_in_colour(rgb, name):
 @pytest.mark.parametrize("name", with_slow(["hg 0.3, sun", "hg 0.65, sun"], "hg 0.3, sun"))
 def test_both_modes_agree_with_anisotropic_scattering(mono, name):
     check(CASES[name], 0.02)
+
+
+# Among surfaces: paths of both modes have random numbers of their own.
+
+COARSE = {"data": 6, "cache": 6, "depth": 0.15}
+SMALL = {
+    "ground, lamp": Case(
+        **COARSE,
+        emitters=dict,
+        objects=lambda: ground() | lamp(),
+        parameters=("sigma_t", "floor", "lamp"),
+    ),
+    "two media, hg 0.5, sun, single": Case(
+        **COARSE,
+        g=0.5,
+        max_depth=2,
+        emitters=lambda: {"sun": SUN},
+        objects=lambda: second_medium(0.5, g=-0.4),
+        parameters=("g", "other.interior_medium.sigma_t"),
+    ),
+    "hg 0.7, emission, ground, sky, alpha": Case(
+        **COARSE,
+        g=0.7,
+        emissive=True,
+        emitters=lambda: {"sky": SKY},
+        objects=ground,
+        pixels="rgba",
+        parameters=("sigma_t", "albedo", "emission"),
+    ),
+}
+
+
+@pytest.fixture
+def fewer_paths(monkeypatch):
+    for module, count in ((surroundings_adjoint, 1 << 18), (surroundings_tangent, 1 << 17)):
+        monkeypatch.setattr(module, "RAYS", count)
+        monkeypatch.setattr(module, "EXCHANGED", count // 4)
+
+
+@pytest.mark.parametrize("name", with_slow(list(SMALL), "hg 0.7, emission, ground, sky, alpha"))
+def test_both_modes_agree_among_surfaces_of_small_scenes(mono, name):
+    check(SMALL[name], 0.03, perturbations=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ground, sky",
+        "lamp over a ground, single",
+        "two media, sky",
+        "hg 0.5, lamp over a ground",
+        "hg 0.54, ground, sky",
+        "hg 0.85, ground, sun",
+        "emission, hg 0.5, sun, single",
+        "room, sky",
+    ],
+)
+def test_both_modes_agree_among_surfaces(mono, name):
+    check(SURROUNDED[name], 0.03)
+
+
+def textured() -> mi.Scene:
+    """A medium over a ground, under a lamp, both with textures."""
+    rng = np.random.default_rng(1)
+
+    def texture(low: float, high: float) -> dict:
+        pixels = mi.Bitmap(np.float32(rng.uniform(low, high, (4, 4, 3))))
+        return {"type": "bitmap", "bitmap": pixels, "raw": True}
+
+    objects = ground() | lamp()
+    objects["floor"]["bsdf"] = {"type": "diffuse", "reflectance": texture(0.3, 0.9)}
+    objects["lamp"]["emitter"] = {"type": "area", "radiance": texture(1, 3)}
+    return Case(data=6, cache=6, emitters=dict, objects=lambda: objects).load()
+
+
+@pytest.mark.parametrize(
+    ("part", "is_leaf"),
+    [
+        ("floor", True),
+        pytest.param("floor", False, marks=pytest.mark.slow),
+        pytest.param("lamp", True, marks=pytest.mark.slow),
+        ("lamp", False),
+    ],
+)
+def test_textures_of_surfaces_and_lamps_change_once(rgb, fewer_paths, part, is_leaf):
+    """Each evaluation of a texture added the change of the texture once more, 40 times in all."""
+    scene = textured()
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if k.startswith(part) and k.endswith(".data")]
+    data, found = mi.TensorXf(dr.detach(params[key])), []
+    weights = np.random.default_rng(3).uniform(0.5, 1.5, (32, 32, 3)).astype(np.float32)
+    for forward in (True, False, True):
+        factor = mi.Float(1.0)
+        dr.enable_grad(factor)
+        leaf = mi.TensorXf(data)
+        if is_leaf:
+            dr.enable_grad(leaf)
+        params[key] = leaf if is_leaf else data * factor
+        params.update()
+        image = mi.render(scene, params, spp=16, seed=1)
+        if forward and is_leaf:
+            dr.set_grad(leaf, data)
+            change = dr.forward_to(image)
+        elif forward:
+            dr.forward(factor)
+            change = dr.grad(image)
+        if forward:
+            found.append((np.array(change, dtype=np.float64) * weights).sum())
+            continue
+        dr.backward(dr.sum(image * mi.TensorXf(weights)))
+        gradient = np.array(dr.grad(leaf if is_leaf else factor), dtype=np.float64)
+        found.append((gradient * np.array(data)).sum() if is_leaf else gradient.sum())
+    assert found[0] == pytest.approx(found[2], rel=1e-5)
+    assert found[0] == pytest.approx(found[1], rel=0.02)
+
+
+def test_views_among_surfaces_share_the_solve(rgb, fewer_paths, monkeypatch):
+    tangent, calls = surroundings_tangent.SurroundingsTangent, []
+    solve = tangent._transported
+    monkeypatch.setattr(tangent, "_transported", lambda *args: calls.append(args) or solve(*args))
+    scene = Case(data=6, cache=6, objects=ground).load()
+    params, factor, _ = attached(scene)
+    images = [mi.render(scene, params, spp=4, seed=seed) for seed in (1, 2)]
+    dr.forward(factor)
+    assert len(calls) == 1
+    assert all(np.array(dr.grad(image)).any() for image in images)
 
 
 def test_forward_mode_is_the_difference_of_images(mono):
@@ -176,12 +313,12 @@ def test_what_has_no_change_by_channel_is_refused(rgb):
     pixels = mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32))
     texture = {"type": "bitmap", "bitmap": pixels, "raw": True}
     projector = {"type": "projector", "to_world": look, "irradiance": texture}
-    for lamp, key, message in (
+    for emitter, key, message in (
         (point, "lamp.intensity.value", "in coloured extinction needs positive values"),
         (projector, "lamp.irradiance.data", "from a texture"),
     ):
         coloured = (0.5, 0.8, 1.0)
-        case = Case(data=8, cache=8, extinction=coloured, emitters=lambda e=lamp: {"lamp": e})
+        case = Case(data=8, cache=8, extinction=coloured, emitters=lambda e=emitter: {"lamp": e})
         scene = case.load()
         params = mi.traverse(scene)
         change = mi.Float(0.0)

@@ -28,7 +28,8 @@ from experiments.validation.gradients.differences import (
     pixel_weights,
 )
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients import paths, surroundings, traced
+from mitsuba_irrcache.gradients import paths, surroundings, surroundings_adjoint, traced
+from mitsuba_irrcache.gradients.surroundings_adjoint import SurroundingsAdjoint
 
 #: Largest relative error of directional derivatives, and the least cosine. The differences
 #: themselves have a noise of 1 to 2 % (standard deviation over seeds of the cache).
@@ -38,8 +39,8 @@ PERTURBATIONS = 2
 
 @pytest.fixture
 def fewer_paths(monkeypatch):
-    monkeypatch.setattr(surroundings, "RAYS", 1 << 18)
-    monkeypatch.setattr(surroundings, "EXCHANGED", 1 << 16)
+    monkeypatch.setattr(surroundings_adjoint, "RAYS", 1 << 18)
+    monkeypatch.setattr(surroundings_adjoint, "EXCHANGED", 1 << 16)
 
 
 def with_gradient_of_albedo() -> tuple[mi.Scene, mi.SceneParameters]:
@@ -62,13 +63,13 @@ def test_paths_from_voxels_are_as_many_as_camera_samples_need(
     """They cost most of a gradient, and the noise of the camera samples exceeds theirs."""
     scene, params = with_gradient_of_albedo()
     counts = []
-    start = surroundings.Surroundings._from_voxels
+    start = SurroundingsAdjoint._from_voxels
 
     def counted(self, number, importance, use, first, rays):
         counts.append((use == surroundings.DERIVATIVES) * rays)
         return start(self, number, importance, use, first, rays)
 
-    monkeypatch.setattr(surroundings.Surroundings, "_from_voxels", counted)
+    monkeypatch.setattr(SurroundingsAdjoint, "_from_voxels", counted)
     image = sum(mi.render(scene, params, spp=spp, seed=seed) for seed in range(views))
     dr.backward(dr.mean(image))
     assert sum(counts) == expected
@@ -80,14 +81,14 @@ def test_images_in_one_loss_have_paths_of_their_own(mono, monkeypatch):
     """
     scene, params = with_gradient_of_albedo()
     drawn = []
-    trace = paths.PathAdjoint.trace
+    trace = paths.TracedPaths.trace
 
     def recorded(self, start):
         if start.adjoint_of_irradiance is None:
             drawn.append(np.array(mi.PCG32(start.rng).next_uint32()))
         return trace(self, start)
 
-    monkeypatch.setattr(paths.PathAdjoint, "trace", recorded)
+    monkeypatch.setattr(paths.TracedPaths, "trace", recorded)
     # Images of several sensors usually have the same seed.
     dr.backward(dr.mean(sum(mi.render(scene, params, spp=1, seed=seed) for seed in (0, 0, 1))))
     assert len(drawn) == 3
@@ -137,7 +138,7 @@ def test_gradients_are_those_of_the_radiance_along_paths(mono, monkeypatch, max_
     numbers, and no interpolation on surfaces. Adjoint fluence of rays along which nothing may be
     scattered any more made an error of 7 %.
     """
-    found, trace = [], paths.PathAdjoint.trace
+    found, trace = [], paths.TracedPaths.trace
 
     def recorded(self, start):
         radiance = trace(self, start)
@@ -145,7 +146,7 @@ def test_gradients_are_those_of_the_radiance_along_paths(mono, monkeypatch, max_
             found.append(np.array(radiance, dtype=np.float64).sum())
         return radiance
 
-    monkeypatch.setattr(paths.PathAdjoint, "trace", recorded)
+    monkeypatch.setattr(paths.TracedPaths, "trace", recorded)
     case = Case(data=8, cache=8, g=g, max_depth=max_depth, objects=ground, directions=256)
     scene = case.load()
     weights, params = pixel_weights(scene), mi.traverse(scene)
@@ -310,9 +311,9 @@ def test_the_same_seed_gives_the_same_bits(rgb, fewer_paths):
 
 
 def test_views_share_the_adjoint_solve(rgb, fewer_paths, monkeypatch):
-    calls, solved = [], surroundings.Surroundings._solved
+    calls, solved = [], SurroundingsAdjoint._solved
     monkeypatch.setattr(
-        surroundings.Surroundings, "_solved", lambda *args: calls.append(args) or solved(*args)
+        SurroundingsAdjoint, "_solved", lambda *args: calls.append(args) or solved(*args)
     )
     scene, params, _ = attached(SMALL)
     images = [mi.render(scene, params, spp=4, seed=seed) for seed in (1, 2)]
@@ -442,12 +443,6 @@ def test_emission_of_zero_is_refused(mono):
 def test_a_mean_cosine_of_zero_is_refused(mono):
     case = Case(data=6, cache=6, g=0.0, objects=ground)
     assert "it is 0, where scattering is isotropic" in refused(case, "phase_function.g")
-
-
-def test_forward_mode_is_refused(rgb, fewer_paths):
-    scene, params, _ = attached(SMALL)
-    with pytest.raises(IrrcacheError, match=r"sigma_t\.data.*dr\.forward was called"):
-        dr.forward_to(mi.render(scene, params, spp=1))
 
 
 def test_media_that_lie_within_each_other_are_refused(rgb):

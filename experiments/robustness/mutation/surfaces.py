@@ -12,6 +12,7 @@ GRADIENTS = "tests/system/test_gradients.py"
 TOLERANCE = "tests/system/test_tolerance.py"
 TOUCHING = "tests/unit/scene/test_clearance.py"
 AMONG_SURFACES = "tests/system/test_gradients_among_surfaces.py"
+FORWARD = "tests/system/test_forward_mode.py"
 
 SURFACES = (
     Mutant(
@@ -170,7 +171,7 @@ SURFACES = (
     ),
     Mutant(
         "paths from voxels do not grow with the views",
-        "gradients/surroundings.py",
+        "gradients/surroundings_adjoint.py",
         "self._samples += film.samples",
         "self._samples = film.samples",
         (AMONG_SURFACES,),
@@ -181,6 +182,34 @@ SURFACES = (
         "word = mi.sample_tea_32(word, dr.opaque(mi.UInt32, view))[0]",
         "word = mi.sample_tea_32(word, dr.opaque(mi.UInt32, 0))[0]",
         (AMONG_SURFACES,),
+    ),
+    Mutant(
+        "changes of textures add up over their evaluations",
+        "gradients/tangent_fields.py",
+        "        self._set(-1)\n        dr.forward_to(value, flags=dr.ADFlag.ClearNone)\n",
+        "",
+        (FORWARD,),
+    ),
+    Mutant(
+        "forward mode neglects radiance that returns to a medium",
+        "gradients/surroundings_tangent.py",
+        "while not self.media[0].single and self._norm(change) > TOLERANCE * scale:",
+        "while False:",
+        (FORWARD,),
+    ),
+    Mutant(
+        "forward mode reads what returns to a medium along its own segment",
+        "gradients/surroundings_tangent.py",
+        "return [self._incident(n, use, read, without_first=n) for n in range(len(self.media))]",
+        "return [self._incident(n, use, read) for n in range(len(self.media))]",
+        (FORWARD,),
+    ),
+    Mutant(
+        "radiance of lamps has no higher moments in forward mode",
+        "gradients/tangent_transport.py",
+        "if not source.sharp:",
+        "if False:",
+        (FORWARD,),
     ),
     Mutant(
         "rays from the BSDF end at emitters that let light through",
