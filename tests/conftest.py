@@ -189,3 +189,11 @@ def out_of_bounds(capfd):
         return [line for line in lines if "out-of-bounds" in line]
 
     return during
+
+
+@pytest.fixture
+def logged(monkeypatch) -> list[str]:
+    """Record what is logged."""
+    texts: list[str] = []
+    monkeypatch.setattr(mi, "Log", lambda _, text: texts.append(text))
+    return texts

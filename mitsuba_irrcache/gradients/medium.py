@@ -248,7 +248,9 @@ class MediumAdjoint:
         - the weights of an environment in both of these.
         """
         ray, camera_rays = each.ray, self._camera_rays
-        visible, background, *weights = camera_rays.background(self._scene, ray, mi.Bool(True))
+        visible, background, *weights = camera_rays.background(
+            self._scene, ray, medium, mi.Bool(True)
+        )
         behind = [each.radiance * background * weight for weight in weights]
         if not (visible or self.is_scaled):
             weights = [mi.Float(0), mi.Float(0)]

@@ -273,10 +273,12 @@ class TracedPaths:
             of_emitters = start.adjoint_of_emitters if number == 0 else None
             weights = weight, weight if of_emitters is None else of_emitters
             parts = self._parts(number, is_from_camera, is_followed, count)
-            skipped = []
+            skipped, ends = [], mi.Bool(False)
             if number == 0 and is_from_camera:
                 skipped = self._media.unnamed(ray, start.medium)
-            of_segment = offset, active, alpha, parts, skipped
+                if start.medium is not None:
+                    ends = ~self._scene.ray_test(ray)
+            of_segment = offset, active, alpha, parts, skipped, ends
             segment = self._segment(ray, weights, arrival[:3], *of_segment)
             self._segments.append(segment)
             total += segment.gathered() + segment.emitted + segment.escaped
@@ -365,15 +367,18 @@ class TracedPaths:
         alpha: mi.Float | None,
         parts: list[tuple[list[CameraReplay], mi.Bool]],
         skipped: list[mi.Bool],
+        ends: mi.Bool,
     ) -> Segment:
         """Follow rays to the next surface.
 
         ``weights`` are those of scattered radiance and of the radiance of emitters; ``skipped``
-        states for each medium, if there are any, which rays do not pass it.
+        states for each medium, if there are any, which rays do not pass it; ``ends`` which rays end
+        at the far plane, behind which nothing is visible to a sensor in a medium.
         """
         (weight, of_emitters), (origin, density, is_seen) = weights, arrival
         hides = is_seen if self._hides else mi.Bool(False)
         end, distance = next_solid(self._scene, ray, active, hides)
+        distance = dr.select(ends, ray.maxt, distance)
         nears, fars, hits = self._media.spans(ray, distance, active)
         for number, mask in enumerate(skipped):
             hits[number] &= ~mask
@@ -382,13 +387,14 @@ class TracedPaths:
         spans = nears, fars, hits
         dr.eval(end, distance, spans)
         scattered, before, through = self._media.march(ray, spans, offset, parts)
-        emitter = end.emitter(self._scene, active)
+        emits = active & ~ends
+        emitter = end.emitter(self._scene, emits)
         record = mi.DirectionSample3f(self._scene, end, origin)
         other = self._scene.pdf_emitter_direction(origin, record, active & ~is_seen)
         share = dr.select(density > 0, power_heuristic(density, other), 1)
         share = dr.select(hides, 0, share)
-        emitter_weight = dr.select(active, of_emitters * through * share, 0)
-        emitted = emitter_weight * emitter.eval(end, active)
+        emitter_weight = dr.select(emits, of_emitters * through * share, 0)
+        emitted = emitter_weight * emitter.eval(end, emits)
         escaped = mi.Spectrum(0)
         if alpha is not None:
             away = active & ~end.is_valid()

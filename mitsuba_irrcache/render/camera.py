@@ -162,7 +162,7 @@ class ClosedFormCameraRays:
         active: mi.Bool,
     ) -> RayResult:
         """Compute the radiance along ``ray``, which starts in ``medium``."""
-        visible, radiance, through, straight = self.background(scene, ray, active)
+        visible, radiance, through, straight = self.background(scene, ray, medium, active)
         hit, near, far = self.span(ray, medium)
         hit &= active
         scattered, transmittance, gathered, emitted = self.projection.march(
@@ -185,11 +185,11 @@ class ClosedFormCameraRays:
         return RayResult(scattered, background, transmittance, alpha, gathered)
 
     def background(
-        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
+        self, scene: mi.Scene, ray: mi.Ray3f, medium: mi.Medium | None, active: mi.Bool
     ) -> tuple[bool, mi.Spectrum, mi.Float, mi.Float]:
         """Return whether an environment is visible behind the medium, its radiance along ``ray``,
-        and its weights for the transmittance of the medium and for that of the medium with the
-        forward peak of its phase function (see `delta_m`).
+        which starts in ``medium``, and its weights for the transmittance of the medium and for that
+        of the medium with the forward peak of its phase function (see `delta_m`).
 
         Narrow sources are attenuated by the latter, because their radiance that the peak scatters
         is part of the scattered radiance. Of a hidden environment, only radiance scattered by the
@@ -209,6 +209,10 @@ class ClosedFormCameraRays:
             narrow = lights.hits_source(mi.Point3f(0), ray.d, mi.Bool(True), mi.Bool(False))
             through = dr.select(narrow, mi.Float(0), 1)
             straight = 1 - through if visible else -through
+        if medium is not None:
+            _, _, leave = self.medium.boundary.intersect(ray)
+            ends = leave > ray.maxt  # at the far plane, behind which nothing is visible
+            through, straight = dr.select(ends, 0, through), dr.select(ends, 0, straight)
         return visible, environment.eval(escaped, active), through, straight
 
     def span(self, ray: mi.Ray3f, medium: mi.Medium | None) -> tuple[mi.Bool, mi.Float, mi.Float]:
@@ -221,7 +225,9 @@ class ClosedFormCameraRays:
         _, entry, leave = self.medium.boundary.intersect(ray)
         # The far plane ends rays only before their first intersection.
         entered = (entry > -1e-5 * (leave - entry)) & (entry < ray.maxt)
-        hit &= (far > 0) if medium is not None else entered
+        if medium is not None:
+            far = dr.select(leave > ray.maxt, dr.minimum(far, ray.maxt), far)
+        hit &= (far > 0) & (near < far) if medium is not None else entered
         return hit, dr.maximum(near, 0), far
 
 
@@ -408,9 +414,13 @@ class TracedCameraRays:
             valid = state.active & si.is_valid()
             # Measure all distances from the camera, so that depths are correct.
             far = dr.select(valid, dr.dot(si.p - ray.o, ray.d), dr.inf)
+            # The far plane ends rays only before their first intersection: in the sensor's medium.
+            is_first = state.active & (state.crossings == 0)
+            ends = is_first & ~valid & (state.pointer != None)  # noqa: E711
+            far = dr.select(ends, ray.maxt, far)
             self._march_media(state, ray, far, offset)
             null = valid & is_null(si.bsdf().flags())
-            crosses = self._add_emitter(scene, state, ray, si, null)
+            crosses = self._add_emitter(scene, state, ray, si, null, ends)
             state.stopped |= valid & ~crosses
             state.escaped |= state.active & ~valid
             state.pointer = dr.select(null, medium_after(si, ray.d, state.pointer), state.pointer)
@@ -452,14 +462,15 @@ class TracedCameraRays:
         ray: mi.Ray3f,
         si: mi.SurfaceInteraction3f,
         null: mi.Bool,
+        ends: mi.Bool,
     ) -> mi.Bool:
-        """Add emission at the end of the segment.
+        """Add emission at the end of the segment, unless it ``ends`` at the far plane.
 
         Returns where the ray continues: behind ``null`` surfaces and hidden emitters.
         """
         valid, shows_emitters = state.active & si.is_valid(), self.max_depth > 0
         emitter = si.emitter(scene, state.active)
-        hit_emitter = state.active & (emitter != None)  # noqa: E711
+        hit_emitter = state.active & ~ends & (emitter != None)  # noqa: E711
         hidden = mi.Bool(False)
         if self.hide_emitters:
             hidden = hit_emitter & (~valid | (state.pointer == None))  # noqa: E711

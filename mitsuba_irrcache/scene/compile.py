@@ -39,6 +39,7 @@ from mitsuba_irrcache.scene.consistency import (
     check_sensor,
     described,
     ray_offset,
+    warn_of_far_plane,
     warn_of_missing_medium,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
@@ -97,6 +98,7 @@ def compile_scene(
     for sensor in scene.sensors():
         check_sensor(scene, sensor)
         warn_of_missing_medium(scene, sensor)
+        warn_of_far_plane(scene, sensor)
     has_surfaces = _has_surfaces(scene)
     boundary = _boundary_without_surfaces(scene, media)
     is_isolated = boundary is not None

@@ -141,6 +141,29 @@ def warn_of_missing_medium(scene: mi.Scene, sensor: mi.Sensor) -> None:
     )
 
 
+def warn_of_far_plane(scene: mi.Scene, sensor: mi.Sensor) -> None:
+    """Log a warning for a far plane that hides what camera rays meet first, a medium among it."""
+    ray, _ = camera_rays(sensor, RAYS)
+    if not np.isfinite(np.array(ray.maxt)).any():
+        return
+    beyond = scene.ray_intersect(mi.Ray3f(ray.o, ray.d))
+    is_hidden = beyond.is_valid() & ~scene.ray_test(ray)
+    if sensor.get_medium() is None:
+        is_hidden &= beyond.is_medium_transition()
+    hidden = int(dr.count(is_hidden)[0])
+    if hidden == 0:
+        return
+    farthest = float(dr.max(dr.select(is_hidden, beyond.t, 0))[0])
+    is_inside = sensor.get_medium() is not None
+    what = "the medium around it, and all behind it," if is_inside else "a medium"
+    mi.Log(
+        mi.LogLevel.Warn,
+        f'irrcache: the far plane of sensor "{sensor.id()}" hides {what} in {hidden / RAYS:.0%} of '
+        f"its view, as with volpath. Raise far_clip (Mitsuba's default is 10000) to more than "
+        f"{farthest:.4g}.",
+    )
+
+
 def _nothing_is_outside(shapes: list[mi.Shape]) -> mi.Bool:
     """Return whether there is certainly no medium outside of all shapes.
 

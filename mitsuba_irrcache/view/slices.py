@@ -123,12 +123,12 @@ class SlicedCameraRays(ClosedFormCameraRays):
         return result
 
     def background(
-        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
+        self, scene: mi.Scene, ray: mi.Ray3f, medium: mi.Medium | None, active: mi.Bool
     ) -> tuple[bool, mi.Spectrum, mi.Float, mi.Float]:
         """Return what is behind the medium, 1 where a ray ends before: no ray march may end early
         because nothing is there.
         """
-        visible, radiance, through, straight = super().background(scene, ray, active)
+        visible, radiance, through, straight = super().background(scene, ray, medium, active)
         ends = self._end < dr.inf
         radiance, through = dr.select(ends, 1, radiance), dr.select(ends, 1, through)
         return visible, radiance, through, dr.select(ends, 0, straight)

@@ -141,6 +141,38 @@ def test_far_planes(scenes, far):
     assert means[0] == pytest.approx(means[1], rel=0.01)
 
 
+@pytest.mark.parametrize("has_ground", [False, True])
+@pytest.mark.parametrize(("far", "is_warned"), [(0.5, True), (1.2, True), (6.0, False)])
+def test_far_planes_of_sensors_in_a_medium(scenes, logged, has_ground, far, is_warned):
+    """Rays that end at the far plane before they leave the medium see nothing behind it, as with
+    volpath: neither medium, nor surfaces, nor an environment. They did: a haze in metres that is
+    larger than 10 km, the default far plane, was 2.7 times too bright.
+    """
+    cube = scenes.boundary(scenes.medium(1.0, 0.5) | {"id": "fog"})
+    objects = {"cube": cube, "sky": {"type": "constant"}}
+    if has_ground:
+        place = mi.ScalarTransform4f().translate([0, -1.5, 0]).rotate([1, 0, 0], -90).scale(4)
+        objects["ground"] = {"type": "rectangle", "to_world": place}
+    sensor = {
+        "type": "perspective", "fov": 70, "far_clip": far, "near_clip": 0.01,
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 0.5], [0, -0.3, -1], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
+        "medium": {"type": "ref", "id": "fog"},
+    }  # fmt: skip
+    settings = {"type": "irrcache", "resolution": 16, "solver": "sweep"}
+    means = []
+    for integrator, spp in ((settings, 64), ({"type": "volpath", "max_depth": 2}, 4096)):
+        scene = mi.load_dict(
+            {"type": "scene", "integrator": integrator | {"max_depth": 2}, **objects}
+            | {"sensor": sensor},
+            optimize=False,
+        )
+        image = np.array(mi.render(scene, spp=spp))[..., :3]
+        means.append(np.array([image[:4].mean(), image[4:].mean()]))
+    np.testing.assert_allclose(means[0], means[1], rtol=0.02)
+    assert any("far plane" in message for message in logged) == is_warned
+
+
 def test_radiance_and_irradiance_meters(scenes):
     """Radiance and irradiance meters agree with volpath.
 
