@@ -65,8 +65,9 @@ LARGE_VARIANCE = 0.15
 #: to 15 % with 0.3.
 LARGE_VARIANCE_AROUND_SENSOR = 0.06
 #: Noise of directions that voxels share, above which a warning is logged. It is 1 to 1.5 % in most
-#: scenes with surfaces; with 2.5 to 4 %, means of images are off by 3 % and parts of them by 12 %.
-LARGE_DIRECTION_NOISE = 0.02
+#: scenes with surfaces; with 1.6 to 2 % parts of images are off by up to 6 %, with 2.5 to 4 % means
+#: by 3 % and parts by 12 %.
+LARGE_DIRECTION_NOISE = 0.016
 #: Number of rays whose mean origin is the position of a sensor.
 SENSOR_RAYS = 16
 #: Lock of the thread that writes a cache file.
@@ -247,7 +248,7 @@ class CachedMedium:
             mi.Log(
                 mi.LogLevel.Warn,
                 f"irrcache: {self.label}the irradiance has a noise of about "
-                f"{100 * self._direction_noise:.0f} % that neighbouring voxels share, because few "
+                f"{100 * self._direction_noise:.1f} % that neighbouring voxels share, because few "
                 "directions meet what emits: errors of several percent are expected in parts of "
                 f"the image. Raise cache_spp (now {self.cache.samples}), or set solver to path.",
             )
