@@ -32,9 +32,9 @@ DISTANCE_RAYS, GATHERED, GATHERED_INDIRECT = 32, 128, 32
 #: Rays by which a node gathers what forward peaks scatter, around each narrow source, and the mean
 #: cosine of the angle between them for a source without extent.
 AROUND_SOURCES, MEAN_COSINE = 32, 0.85
-#: Nodes of a view up to which all rays are used, at most, and for each pixel of the image: more
-#: nodes are close to each other, so that their errors average out within a pixel.
-FINE_NODES, FINE_NODES_PER_PIXEL = 1 << 15, 2
+#: Nodes of a view up to which all rays are used: more nodes are close to each other, so that their
+#: errors average out within a pixel.
+FINE_NODES = 1 << 15
 #: Number of nodes from which on no further ones are created.
 MOST_NODES = 1 << 18
 #: Number of rounds in which nodes are created: the first where camera rays end, others where rays
@@ -67,13 +67,11 @@ class SurfaceIrradiance:
         seed: int,
         refinement: int = 1,
         groups: Sequence[tuple[int, int, int]] = (),
-        fewest_pixels: float = np.inf,
     ) -> None:
         """Gather radiance along ``refinement`` times the usual numbers of rays.
 
         ``groups`` are those of the nodes that ``paths`` have already: the first of consecutive
-        nodes, the end, and the usual number of rays. ``fewest_pixels`` is the number of pixels
-        along the smallest image whose nodes use fewer rays for this reason.
+        nodes, the end, and the usual number of rays.
         """
         self.paths, self.nodes, self.seed = paths, paths.nodes, seed
         self._refinement = refinement
@@ -83,21 +81,14 @@ class SurfaceIrradiance:
         self._exchange: list[Exchange] = []
         self._gathered = 0  # groups
         self._view: ViewExtent | None = None  # the last one
-        self._fewest_pixels = fewest_pixels
 
     def renewed(self, paths: SurfacePaths, refinement: int = 1) -> SurfaceIrradiance:
         """Return the same nodes, with irradiance gathered again along ``paths``."""
-        return SurfaceIrradiance(paths, self.seed, refinement, self._groups, self._fewest_pixels)
+        return SurfaceIrradiance(paths, self.seed, refinement, self._groups)
 
     def has_space_for(self, view: ViewExtent) -> bool:
-        """Return whether nodes for ``view`` can be added, or were computed last.
-
-        Nodes for an image of few pixels are too noisy for larger ones.
-        """
-        if view == self._view:
-            return True
-        is_too_noisy = view.pixels > 1.5 * self._fewest_pixels
-        return self.nodes.count < MOST_NODES and not is_too_noisy
+        """Return whether nodes for ``view`` can be added, or were computed last."""
+        return self.nodes.count < MOST_NODES or view == self._view
 
     def prepare(
         self, scene: mi.Scene, view: ViewExtent, ray: mi.Ray3f, pointer: mi.MediumPtr
@@ -163,20 +154,9 @@ class SurfaceIrradiance:
             if not found:
                 break
             place, active = (_joined(parts) for parts in zip(*found, strict=True))
-        rays = self._rays_for(seen - first)
+        rays = GATHERED if seen - first <= FINE_NODES else GATHERED_INDIRECT
         groups = (first, seen, rays), (seen, self.nodes.count, GATHERED_INDIRECT)
         self._groups += [group for group in groups if group[0] < group[1]]
-
-    def _rays_for(self, nodes: int) -> int:
-        """Return the number of rays of each of the ``nodes`` that camera rays need."""
-        if nodes > FINE_NODES:
-            return GATHERED_INDIRECT
-        pixels = self._view.pixels
-        share = FINE_NODES_PER_PIXEL * pixels**2 / max(nodes, 1)
-        if share >= 1:
-            return GATHERED
-        self._fewest_pixels = min(self._fewest_pixels, pixels)
-        return max(1 << int(np.ceil(np.log2(GATHERED * share))), GATHERED_INDIRECT)
 
     def _place(self, scene: mi.Scene, numbers: mi.UInt32, medium: mi.UInt32) -> tuple:
         """Place new nodes on surfaces. ``medium`` is the number of the one in front of the points
