@@ -131,6 +131,8 @@ class SceneState:
         """
         changes = {key: dr.grad(self.params[key]) for key in self._identity}
         with dr.suspend_grad(), self.integrator.exclusively():
+            # Further images do not share the irradiance: Dr.Jit forgets its edges.
+            self._is_solved = True
             revision, tangent = self.integrator.revision(self.scene), None
             if self._tangent is not None and self._tangent[0] == revision:
                 tangent = self._tangent[2] if _same(self._tangent[1], changes) else None

@@ -56,13 +56,18 @@ class SurroundingsTangent(Surroundings):
     ) -> None:
         super().__init__(scene, media, hide_emitters, kinds, seed)
         self._changes = changes
-        pairs = zip(changes.media, self._transported(), strict=True)
+        with changes.attached.alone():
+            pairs = zip(changes.media, self._transported(), strict=True)
         own = [replace(medium, collisions=collisions) for medium, collisions in pairs]
         #: changes of the scene and of the fluence
         self._all = changes._replace(media=own)
 
     def image(self, film: FilmTangent) -> mi.TensorXf:
         """Return the change of the image that ``film`` takes."""
+        with self._changes.attached.alone():
+            return self._image(film)
+
+    def _image(self, film: FilmTangent) -> mi.TensorXf:
         self._views += 1
         sees = self._scene.environment() is not None and not self._hides
         has_alpha = film.has_alpha and not sees

@@ -4,7 +4,8 @@ reads changes of these fields at the same positions, and adds up the products.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -123,10 +124,42 @@ class MediumChanges:
 
 
 class AttachedParameters:
-    """Parameters of emitters and BSDFs in Dr.Jit's graph, and ``changes`` of them."""
+    """The parameters ``keys`` of emitters and BSDFs in Dr.Jit's graph, and ``changes`` of all
+    parameters, by key.
+    """
 
-    def __init__(self, parameters: Sequence[object], changes: Sequence[object]) -> None:
-        self._pairs = list(zip(parameters, changes, strict=True))
+    def __init__(
+        self, params: mi.SceneParameters, keys: Sequence[str], changes: Mapping[str, object]
+    ) -> None:
+        self._params, self._keys, self._changes = params, keys, changes
+        self._pairs: list[tuple] = []
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Evaluate emitters and BSDFs with variables that nothing else in the graph depends on.
+
+        Dr.Jit would propagate to all that does. Plugins copy tensors themselves.
+        """
+        with dr.resume_grad():
+            # Copies: Mitsuba returns references to variables of plugins.
+            values = [(key, self._params[key]) for key in self._keys]
+            kept = {key: type(value)(value) for key, value in values}
+        try:
+            for key, value in kept.items():
+                variable = value
+                if not dr.is_tensor_v(value):
+                    with dr.resume_grad():
+                        variable = type(value)(dr.detach(value))
+                        dr.enable_grad(variable)
+                        self._params[key] = variable
+                self._pairs.append((variable, self._changes[key]))
+            yield
+        finally:
+            with dr.resume_grad():
+                for key, value in kept.items():
+                    if not dr.is_tensor_v(value):
+                        self._params[key] = value
+            self._pairs = []
 
     def change_of(self, value: mi.Spectrum) -> mi.Spectrum:
         """Return the change of a ``value`` that depends on the parameters."""

@@ -165,9 +165,7 @@ class TracedAdjoint:
         for medium, own in zip(media, found, strict=True):
             medium.remove_peak(own)
         attached = [key for key, role in self._roles.items() if not isinstance(role, tuple)]
-        own = AttachedParameters(
-            [self._params[k] for k in attached], [changes[k] for k in attached]
-        )
+        own = AttachedParameters(self._params, attached, changes)
         return SurroundingsTangent(self._scene, media, *others, SceneChanges(found, own))
 
     @cached_property
