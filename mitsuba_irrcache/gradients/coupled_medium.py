@@ -60,10 +60,11 @@ class AdjointFluence:
 
     def __add__(self, other: AdjointFluence) -> AdjointFluence:
         pairs = (self.camera, other.camera), (self.travelled, other.travelled)
-        return AdjointFluence(*(_sums(*pair) for pair in pairs))
+        return AdjointFluence(*(added_components(*pair) for pair in pairs))
 
 
-def _sums(first: list[Components], second: list[Components]) -> list[Components]:
+def added_components(first: list[Components], second: list[Components]) -> list[Components]:
+    """Return the sums of all components of each channel."""
     return [[a + b for a, b in zip(*own, strict=True)] for own in zip(first, second, strict=True)]
 
 

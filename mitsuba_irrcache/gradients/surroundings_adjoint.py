@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker_words, unit_floats
-from mitsuba_irrcache.gradients.coupled_medium import AdjointFluence, CoupledMedium, Importance
+from mitsuba_irrcache.gradients.coupled_medium import AdjointFluence, Importance
 from mitsuba_irrcache.gradients.film import FilmAdjoint
 from mitsuba_irrcache.gradients.path_derivatives import PathAdjoint
 from mitsuba_irrcache.gradients.paths import Start
@@ -47,17 +47,7 @@ class SurroundingsAdjoint(Surroundings):
     """
 
     paths = PathAdjoint
-
-    def __init__(
-        self,
-        scene: mi.Scene,
-        media: list[CoupledMedium],
-        hide_emitters: bool,
-        kinds: tuple[bool, bool],
-        seed: int,
-    ) -> None:
-        super().__init__(scene, media, hide_emitters, kinds, seed)
-        self._samples = 0  # camera samples of all views so far
+    _samples = 0  # camera samples of all views so far
 
     # Views
 

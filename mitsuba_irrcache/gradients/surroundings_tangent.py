@@ -12,7 +12,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.gradients.coupled_medium import CoupledMedium
+from mitsuba_irrcache.gradients.coupled_medium import CoupledMedium, added_components
 from mitsuba_irrcache.gradients.film import FilmTangent
 from mitsuba_irrcache.gradients.path_derivatives import PathTangent
 from mitsuba_irrcache.gradients.paths import Start
@@ -93,7 +93,8 @@ class SurroundingsTangent(Surroundings):
                 warn_of_exchanges()
                 break
             change = self._propagated(self._returned(change, number))
-            total = [_sums(*own) for own in zip(total, change, strict=True)]
+            total = [added_components(*own) for own in zip(total, change, strict=True)]
+            dr.eval(total)
             number += 1
         return self._readable(total)
 
@@ -144,9 +145,3 @@ class SurroundingsTangent(Surroundings):
         ]
         dr.eval(sums)
         return sum(float(each[0]) for each in sums)
-
-
-def _sums(first: list[Components], second: list[Components]) -> list[Components]:
-    found = [[a + b for a, b in zip(*own, strict=True)] for own in zip(first, second, strict=True)]
-    dr.eval(found)
-    return found

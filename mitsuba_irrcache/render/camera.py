@@ -224,10 +224,11 @@ class ClosedFormCameraRays:
         # through the boundary, even if the grid covers only a part of it.
         _, entry, leave = self.medium.boundary.intersect(ray)
         # The far plane ends rays only before their first intersection.
-        entered = (entry > -1e-5 * (leave - entry)) & (entry < ray.maxt)
         if medium is not None:
             far = dr.select(leave > ray.maxt, dr.minimum(far, ray.maxt), far)
-        hit &= (far > 0) & (near < far) if medium is not None else entered
+            hit &= (far > 0) & (near < far)
+        else:
+            hit &= (entry > -1e-5 * (leave - entry)) & (entry < ray.maxt)
         return hit, dr.maximum(near, 0), far
 
 
