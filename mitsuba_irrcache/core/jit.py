@@ -1,4 +1,6 @@
-"""Dr.Jit loops written in Python syntax, integer division, opaque points, and concatenation."""
+"""Dr.Jit loops written in Python syntax, integer division, opaque points, arrays from NumPy, and
+concatenation.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +10,12 @@ from functools import wraps
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
+
+#: Alignment of arrays from NumPy, in values.
+ALIGNMENT = 16
 
 
 def symbolic(function: Callable) -> Callable:
@@ -80,6 +86,19 @@ def unravelled(index: mi.UInt32, sides: Sequence[Divisor]) -> tuple[mi.UInt32, .
 def opaque_point(values: Iterable[float]) -> mi.Point3f:
     """Return a point that is an argument of kernels and not a constant in them."""
     return mi.Point3f([dr.opaque(mi.Float, float(v)) for v in values])
+
+
+def from_numpy(values: np.ndarray) -> mi.Float:
+    """Return all ``values`` as a flat array, in single precision.
+
+    Dr.Jit references the memory of NumPy, and its kernels depend on the alignment, which therefore
+    is always the same.
+    """
+    buffer = np.empty(values.size + ALIGNMENT, dtype=np.float32)
+    start = -(buffer.ctypes.data // buffer.itemsize) % ALIGNMENT
+    aligned = buffer[start : start + values.size]
+    aligned[:] = values.ravel()
+    return mi.Float(aligned)
 
 
 def concatenated(parts: Sequence[dr.ArrayBase]) -> dr.ArrayBase:

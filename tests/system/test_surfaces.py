@@ -241,6 +241,24 @@ def test_hidden_emitters_and_alpha(scenes, hide):
     assert (found[0][..., 3].mean() < 0.9) == hide
 
 
+def test_radiance_behind_a_hidden_lamp(scenes):
+    """What is behind a closed lamp that is hidden has the radiance that a sensor sees whose near
+    plane is behind the lamp. `volpath` and `volpathmis` have twice that radiance.
+    """
+    lamp = {"type": "sphere", "center": (0.2, 0.4, -1.5), "radius": 0.15}
+    lamp["emitter"] = {"type": "area", "radiance": 7.0}
+    found = []
+    for near in (0.01, 4.1):  # the lamp ends at 3.9, and the fog begins at 4.3
+        sensor = scenes.description({}, None, SIZE)["sensor"] | {"near_clip": near}
+        objects = {"ball": bound("sphere", fog()), "lamp": lamp, "sensor": sensor}
+        settings = {"resolution": 16, "cache_spp": 64, "max_depth": 2, "hide_emitters": True}
+        integrator = {"type": "irrcache"} | settings
+        scene = scenes.load(integrator, None, SIZE, **objects, emitter=None, default_solver="auto")
+        found.append(scenes.image(scene, spp=16))
+    assert found[0].mean() > 0.001
+    np.testing.assert_allclose(*found, rtol=5e-3, atol=2e-3 * found[0].mean())
+
+
 @pytest.mark.parametrize("max_depth", [-1, 3])
 def test_alpha_behind_a_mask(scenes, max_depth):
     """Fog behind a partly transparent card is not transparent: with all orders alpha was that of

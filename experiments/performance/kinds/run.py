@@ -4,8 +4,9 @@
         [--budget 1200] [--variant cuda_ad_rgb] [--force] [-o output]
         [--document docs/performance.md]
 
-Each scene is rendered by ``irrcache`` with its default properties, with all orders of scattering,
-and 1, 4, 16 and 64 samples per pixel until the smallest target is reached. Errors are RMSE in units
+Each scene is rendered by ``irrcache`` with all orders of scattering, with default properties and
+with coarser ones (COARSER), with 1, 4, 16 and 64 samples per pixel until the smallest target is
+reached. Errors are RMSE in units
 of the mean radiance, net of the noise of a reference of two halves (``--seconds`` each, by volpath
 unless another stock integrator is much faster). Beside them the best of volpath, volpathmis and
 prbvolpath at its best ``rr_depth``, whose time to an error is its variance over the square of the
@@ -35,6 +36,8 @@ from mitsuba_irrcache.compare.tables import Table
 
 TARGETS = (1e-2, 3e-3)
 SPP = (1, 4, 16, 64)
+#: Coarser settings: resolution in units of the default one, and ``cache_spp``, 0 for the default.
+COARSER = tuple(product((1, 1 / 2, 1 / 3), (0, 64, 32)))[1:]
 #: Samples per pixel of the column "defaults"; Mitsuba's samplers have 4.
 DEFAULT_SPP = 16
 STOCK, RR_DEPTHS = ("volpath", "volpathmis", "prbvolpath"), (5, 1000)
@@ -52,10 +55,12 @@ RUNS, PATIENCE = 2, 20.0
 BLOCK = 8
 
 
-def load(build: Callable[[], dict], pixels: int, integrator: str, rr_depth: int = 5) -> mi.Scene:
+def load(
+    build: Callable[[], dict], pixels: int, integrator: str, rr_depth: int = 5, **properties: float
+) -> mi.Scene:
     """Load the scene anew, with a cold cache."""
     gc.collect()
-    properties = {"type": integrator, "max_depth": -1, "rr_depth": rr_depth}
+    properties |= {"type": integrator, "max_depth": -1, "rr_depth": rr_depth}
     scene = {"type": "scene", "integrator": properties, "sensor": sensor()} | build()
     scene["sensor"] |= {"film": film(pixels)}
     scene = mi.load_dict(scene)
@@ -79,14 +84,16 @@ def compute(build: Callable[[], dict], pixels: int, reference_seconds: float) ->
     used = volpath if volpath["cost"] < MUCH_FASTER * best["cost"] else best
     halves = reference(load(build, pixels, used["name"], used["rr_depth"]), used, reference_seconds)
     mean = float(np.mean(halves))
-    ours = []
-    for spp in SPP:
-        ours.append(irrcache_row(build, pixels, spp, halves))
-        if ours[-1]["rmse"] < min(TARGETS) and spp >= DEFAULT_SPP:
-            break
-    name = solver_of(build, pixels)
-    resolved = ours[-1].pop("resolved")
-    return {"stock": best, "resolved": resolved, "mean": mean, "irrcache": ours, "solver": name}
+    ours = irrcache_rows(build, pixels, halves, DEFAULT_SPP)
+    solver, resolution = choice_of(build, pixels)
+    coarser = []
+    for share, samples in COARSER:
+        settings = {"resolution": max(round(share * resolution), 2), "cache_spp": samples}
+        coarser += irrcache_rows(build, pixels, halves, 1, **settings)
+    return {
+        "stock": best, "resolved": ours[-1]["resolved"], "mean": mean, "irrcache": ours,
+        "coarser": coarser, "solver": solver,
+    }  # fmt: skip
 
 
 def stock_row(build: Callable[[], dict], pixels: int, name: str, rr_depth: int) -> dict:
@@ -131,18 +138,36 @@ def reference(scene: mi.Scene, stock: dict, seconds: float) -> list[np.ndarray]:
     ]
 
 
+def irrcache_rows(
+    build: Callable[[], dict], pixels: int, halves: list[np.ndarray], least: int, **settings: int
+) -> list[dict]:
+    """Return rows for increasing samples per pixel, until there are ``least`` of them and the
+    smallest target is reached.
+    """
+    rows = []
+    for spp in SPP:
+        rows.append(irrcache_row(build, pixels, spp, halves, settings))
+        if rows[-1]["rmse"] < min(TARGETS) and spp >= least:
+            break
+    return rows
+
+
 def irrcache_row(
-    build: Callable[[], dict], pixels: int, spp: int, halves: list[np.ndarray]
+    build: Callable[[], dict],
+    pixels: int,
+    spp: int,
+    halves: list[np.ndarray],
+    settings: dict[str, int],
 ) -> dict:
     """Return errors of the image with ``spp`` samples per pixel, and its times."""
-    scene = load(build, pixels, "irrcache")
+    scene = load(build, pixels, "irrcache", **settings)
     picture(scene, spp, 0)  # compiles kernels
     mean, rows = np.mean(halves), []
     for seed in range(RUNS):
         # Free the scene before: Dr.Jit's kernels contain the numbers of the scene's objects, which
         # are others while the old ones exist.
         scene = None
-        scene = load(build, pixels, "irrcache")
+        scene = load(build, pixels, "irrcache", **settings)
         image, cold = picture(scene, spp, seed)
         moved = picture(scene, spp, seed + 100)[1]
         a, b = (image - half for half in halves)
@@ -155,7 +180,7 @@ def irrcache_row(
     cold, moved = np.median(rows, axis=0)[:2]
     square, bias, blocks, spread = np.mean(rows, axis=0)[2:]
     return {
-        "spp": spp, "cold": float(cold), "moved": float(moved),
+        **settings, "spp": spp, "cold": float(cold), "moved": float(moved),
         "rmse": float(np.sqrt(max(square, 0)) / mean), "mean": float(bias / mean),
         "blocks": float(np.sqrt(max(blocks, 0)) / mean), "resolved": float(np.sqrt(spread) / mean),
     }  # fmt: skip
@@ -169,11 +194,13 @@ def block_error(a: np.ndarray, b: np.ndarray) -> float:
     return float((a * b).mean())
 
 
-def solver_of(build: Callable[[], dict], pixels: int) -> str:
-    """Return the name of the solver that was selected."""
+def choice_of(build: Callable[[], dict], pixels: int) -> tuple[str, int]:
+    """Return the solver that was selected, and the default resolution."""
     scene = load(build, pixels, "irrcache")
     scene.integrator().prepare(scene)
-    return scene.integrator()._builder.solver
+    builder = scene.integrator()._builder
+    caches = [part.cache for part in builder.parts if part.cache is not None]
+    return builder.solver, max(max(cache.grid.shape) for cache in caches)
 
 
 def table(rows: dict[str, dict], pixels: int, variant: str) -> Table:
@@ -182,7 +209,9 @@ def table(rows: dict[str, dict], pixels: int, variant: str) -> Table:
     """
     head = ["scene", "solver"]
     head += [f"RMSE {target:.1%}" for target in TARGETS]
-    head += [f"camera moved, {min(TARGETS):.1%}", "faster below"]
+    head += [f"camera moved, {min(TARGETS):.1%}"]
+    head += [f"best settings, {target:.1%}" for target in TARGETS]
+    head += ["faster below"]
     head += [f"RMSE at {DEFAULT_SPP} spp", f"of {BLOCK} x {BLOCK} blocks", "mean"]
     cells = [[name, row["solver"], *_speeds(row), *_errors(row)] for name, row in rows.items()]
     title = f"Ratios to the best stock integrator, {pixels} x {pixels} pixels, {variant}"
@@ -192,20 +221,32 @@ def table(rows: dict[str, dict], pixels: int, variant: str) -> Table:
 def _speeds(row: dict) -> list[str]:
     """Format the ratios of the times to each target, and the error below which a cache pays."""
     cells, cost = [], row["stock"]["cost"]
-    for target, key in [(t, "cold") for t in TARGETS] + [(min(TARGETS), "moved")]:
-        found = [r[key] for r in row["irrcache"] if max(r["rmse"], row["resolved"]) <= target]
-        stock = cost / target**2
+    default, coarser = row["irrcache"], row["coarser"]
+    wanted = [(default, target, "cold") for target in TARGETS]
+    wanted += [(default, min(TARGETS), "moved")]
+    wanted += [(default + coarser, target, "cold") for target in TARGETS]
+    for rows, target, key in wanted:
+        found = [r for r in rows if max(r["rmse"], row["resolved"]) <= target]
         if row["resolved"] > target:
             cells.append("not resolved")
         elif not found:
             cells.append("not reached")
         else:
-            cells.append(f"{plain_number(stock / min(found))} x, {min(found):.2g} s")
+            best = min(found, key=lambda r, key=key: r[key])
+            ratio = plain_number(cost / target**2 / best[key])
+            cells.append(f"{ratio} x, {best[key]:.2g} s{_settings(best)}")
     # An image of error e takes the cache's time and that of its samples, which goes with e^-2.
     last = row["irrcache"][-1]
     error, once = max(last["rmse"], row["resolved"]), max(last["cold"] - last["moved"], 1e-3)
     saved = cost - last["moved"] * error**2
     return [*cells, f"{np.sqrt(saved / once):.1%}" if saved > 0 else "never"]
+
+
+def _settings(row: dict) -> str:
+    """Format resolution, directions and samples per pixel if they are not the defaults."""
+    if "resolution" not in row:
+        return ""
+    return f" ({row['resolution']}, {row['cache_spp'] or 'default'}, {row['spp']})"
 
 
 def _errors(row: dict) -> list[str]:

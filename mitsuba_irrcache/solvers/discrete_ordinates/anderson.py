@@ -19,6 +19,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
 TINY = 1e-300
 #: Maximum extrapolation beyond the image of the last step, in units of the last change of images.
 MAX_EXTRAPOLATION = 20.0
+#: Ratio of the eigenvalues of products of residuals below which the smaller one is ignored.
+SINGULAR = 1e-12
 
 
 class AndersonAcceleration:
@@ -55,16 +57,15 @@ class AndersonAcceleration:
         return result
 
 
-def accelerated(history: list, channel: int) -> np.ndarray:
+def accelerated(images: np.ndarray, residuals: np.ndarray) -> np.ndarray:
     """Return the combination of images with the smallest residual: Anderson acceleration of any
     depth, for small arrays.
 
-    ``history`` is a list of (iterate, image), each (channels, n), of which one channel is used.
+    ``images`` of the last iterates and their ``residuals``, images minus iterates, are (iterates,
+    channels, n), the last one last; channels are independent. Returns (channels, n).
     """
-    points, images = (np.array([x[channel] for x in xs]) for xs in zip(*history, strict=True))
-    residuals = images - points
-    if len(history) == 1:
-        return images[0]
-    differences = (residuals[:-1] - residuals[-1]).T
-    share, *_ = np.linalg.lstsq(differences, -residuals[-1], rcond=1e-8)
-    return images[-1] + share @ (images[:-1] - images[-1])
+    differences = (residuals[:-1] - residuals[-1]).transpose(1, 0, 2)
+    products = differences @ differences.transpose(0, 2, 1)
+    inverse = np.linalg.pinv(products, rcond=SINGULAR, hermitian=True)
+    share = -inverse @ (differences @ residuals[-1][:, :, None])
+    return images[-1] + (share * (images[:-1] - images[-1]).transpose(1, 0, 2)).sum(axis=1)

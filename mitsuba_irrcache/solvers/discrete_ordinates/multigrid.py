@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.jit import from_numpy
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid, stencil
 from mitsuba_irrcache.solvers.discrete_ordinates.anderson import (
@@ -414,14 +415,11 @@ class MultigridLevel:
     def _source_iteration(self, b: mi.Float, table: TrackTable) -> mi.Float:
         """Solve by source iteration with Anderson acceleration, for few voxels."""
         first = np.array(b, dtype=np.float64).reshape(-1, self.channels).T
-        phi, history = first.copy(), []
+        phi, images, residuals = first, [], []
         scale = np.abs(first).mean(axis=1)
         for _ in range(MAX_ITERATIONS):
-            # Pass lists: Dr.Jit references NumPy's memory, and kernels depend on its alignment.
-            scattered = np.array(self.collisions(mi.Float(phi.T.ravel().tolist()), table))
+            scattered = np.array(self.collisions(from_numpy(phi.T), table))
             image = scattered.reshape(-1, self.channels).T + first
-            history.append((phi, image))
-            history = history[-HISTORY:]
             residual = image - phi
             if not np.isfinite(residual).all():
                 raise IrrcacheError(
@@ -431,8 +429,9 @@ class MultigridLevel:
                 )
             if (np.abs(residual).mean(axis=1) <= self._tolerance * scale).all():
                 break
-            phi = np.array([accelerated(history, c) for c in range(self.channels)])
-        return mi.Float(image.T.ravel().tolist())
+            images, residuals = [*images, image][-HISTORY:], [*residuals, residual][-HISTORY:]
+            phi = accelerated(np.array(images), np.array(residuals))
+        return from_numpy(image.T)
 
 
 def _coarsening(grid: Grid) -> np.ndarray:

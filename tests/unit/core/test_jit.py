@@ -1,4 +1,4 @@
-"""Functions with Dr.Jit loops in Python syntax, transformed on first use."""
+"""Functions with Dr.Jit loops in Python syntax, transformed on first use; arrays from NumPy."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import os
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import from_numpy, symbolic
 from mitsuba_irrcache.errors import IrrcacheError
 
 
@@ -47,3 +48,17 @@ def test_a_file_that_was_changed_after_its_import_is_refused(rgb, tmp_path):
     os.utime(file, ns=(1, 1))
     with pytest.raises(IrrcacheError, match="was changed after it was imported"):
         function(mi.Float(1))
+
+
+def test_arrays_from_numpy_share_kernels(rgb):
+    """Values are those of the array, whatever its layout, type and address, by one kernel."""
+    values = np.arange(24.0).reshape(4, 6)
+    hashes = set()
+    for array in (values, values.T, values[:, 1:], values.astype(np.float32).ravel()[3:]):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            doubled = 2 * from_numpy(array)
+            dr.eval(doubled)
+            hashes |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+        np.testing.assert_array_equal(doubled, 2 * array.ravel())
+    assert len(hashes) == 1

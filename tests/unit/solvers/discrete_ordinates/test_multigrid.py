@@ -10,7 +10,7 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.discrete_ordinates import multigrid, tracks
-from mitsuba_irrcache.solvers.discrete_ordinates.anderson import AndersonAcceleration
+from mitsuba_irrcache.solvers.discrete_ordinates.anderson import AndersonAcceleration, accelerated
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import hemisphere_ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource
@@ -179,3 +179,22 @@ def test_anderson_acceleration_removes_a_slow_error():
 
 def by_channel(integrand: Callable, *fields: mi.Float) -> np.ndarray:
     return np.array(integrand(*fields)).reshape(-1, 2).sum(axis=0)
+
+
+def test_anderson_acceleration_of_several_steps():
+    """With as many earlier steps as there are unknowns, a linear iteration is solved exactly, for
+    each channel by itself; also from a single step, and where a residual is repeated.
+    """
+    random = np.random.default_rng(3)
+    matrices = 0.3 * random.normal(size=(2, 3, 3))
+    solution = random.uniform(1, 2, (2, 3))
+    phi, images, residuals = np.zeros((2, 3)), [], []
+    for _ in range(4):
+        image = solution + np.einsum("cij,cj->ci", matrices, phi - solution)
+        images, residuals = [*images, image], [*residuals, image - phi]
+        phi = accelerated(np.array(images), np.array(residuals))
+        assert np.isfinite(phi).all()
+    np.testing.assert_allclose(phi, solution, rtol=1e-6)
+    np.testing.assert_array_equal(accelerated(np.array([image]), np.array([image - phi])), image)
+    twice = accelerated(np.array([image, image]), np.array([image - phi] * 2))
+    np.testing.assert_array_equal(twice, image)
