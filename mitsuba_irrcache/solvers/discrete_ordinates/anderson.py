@@ -19,8 +19,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
 TINY = 1e-300
 #: Maximum extrapolation beyond the image of the last step, in units of the last change of images.
 MAX_EXTRAPOLATION = 20.0
-#: Ratio of the eigenvalues of products of residuals below which the smaller one is ignored.
-SINGULAR = 1e-12
+#: Ratio of singular values of the changes of residuals below which the smaller one is ignored.
+SINGULAR = 1e-8
 
 
 class AndersonAcceleration:
@@ -64,8 +64,10 @@ def accelerated(images: np.ndarray, residuals: np.ndarray) -> np.ndarray:
     ``images`` of the last iterates and their ``residuals``, images minus iterates, are (iterates,
     channels, n), the last one last; channels are independent. Returns (channels, n).
     """
-    differences = (residuals[:-1] - residuals[-1]).transpose(1, 0, 2)
-    products = differences @ differences.transpose(0, 2, 1)
-    inverse = np.linalg.pinv(products, rcond=SINGULAR, hermitian=True)
-    share = -inverse @ (differences @ residuals[-1][:, :, None])
-    return images[-1] + (share * (images[:-1] - images[-1]).transpose(1, 0, 2)).sum(axis=1)
+    result = images[-1].copy()
+    if len(images) > 1:
+        for channel, final in enumerate(residuals[-1]):
+            differences = (residuals[:-1, channel] - final).T
+            share, *_ = np.linalg.lstsq(differences, -final, rcond=SINGULAR)
+            result[channel] += share @ (images[:-1, channel] - images[-1, channel])
+    return result

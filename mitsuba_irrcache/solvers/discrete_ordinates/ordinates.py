@@ -82,6 +82,10 @@ class OrdinateSet:
         """Run `MultigridLevel.sweep` with the incoming radiance."""
         return level.sweep(phi, level.tracks.table(*self.ordinates))
 
+    def collisions(self, level: MultigridLevel, phi: mi.Float | None) -> mi.Float:
+        """Return the second result of `sweep`."""
+        return level.collisions(phi, level.tracks.table(*self.ordinates))
+
     def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
         """Solve for all orders of scattering, given the uncollided ``b``.
 
@@ -153,6 +157,10 @@ class BoundaryOrdinateSet:
         both = tuple(a + b for a, b in zip(found, scattered, strict=True))
         dr.eval(both)
         return both
+
+    def collisions(self, level: MultigridLevel, phi: mi.Float | None) -> mi.Float:
+        """Return the second result of `sweep`."""
+        return self.sweep(level, phi)[1]
 
     def exchanged(self, level: MultigridLevel, phi: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Run `MultigridLevel.sweep` without incoming radiance."""

@@ -567,12 +567,11 @@ class Sweep:
         """Return the mean irradiance of collisions of all orders but the last, computed with the
         set ``first``. ``passes`` is the number of passes that follow.
         """
-        _, phi = first.sweep(level, None)
-        phi = self._add_sampled(phi, channels)
+        phi = self._add_sampled(first.collisions(level, None), channels)
         if self.cache.max_depth < 0:
             return first.solve(level, phi, passes)
         for order in range(self.cache.max_depth - 3):
-            before, phi = phi, self._add_sampled(first.sweep(level, phi)[1], channels)
+            before, phi = phi, self._add_sampled(first.collisions(level, phi), channels)
             # Omit further orders once they are negligible, whatever max_depth is.
             if order % CHECKED_ORDERS == CHECKED_ORDERS - 1 and _change(before, phi) < NEGLIGIBLE:
                 break

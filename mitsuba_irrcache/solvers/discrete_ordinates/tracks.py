@@ -62,6 +62,8 @@ LAYERS = 3
 #: Number of voxels up to which one launch sweeps all ordinates, each into a copy of the volume. The
 #: copies are added in a fixed order, because atomic sums are not reproducible.
 SMALL_GRID = 40**3
+#: Factor of that number with surfaces among the voxels, for which Dr.Jit traces a launch longer.
+LARGER_WITH_SURFACES = 4
 #: Maximum number of voxels of all copies together: 64 MB with a source.
 MAX_COPIED_VOXELS = 1 << 22
 
@@ -100,7 +102,8 @@ class Tracks:
         self._indices = dr.arange(mi.UInt32, self._count)
         dr.eval(self._indices)
         #: whether one launch sweeps many ordinates
-        self.one_launch = grid.voxel_count <= SMALL_GRID
+        small = SMALL_GRID * (1 if surfaces is None else LARGER_WITH_SURFACES)
+        self.one_launch = grid.voxel_count <= small
         self._extinction = Extinction(grid, self.extinction_grid, sigma_t)
         self.active = dr.arange(mi.UInt32, grid.voxel_count) if active is None else active
         self.active_count = dr.width(self.active)
