@@ -284,6 +284,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._image = ImageRenderer(self._options)
         # Held by the images that share it: they hold the integrator.
         self._shared: ref[SharedIrradiance] | None = None
+        self._has_warned_of_border = False
         #: called with (stage, done, total) while the cache is built; exceptions end the build
         self.progress = None
 
@@ -577,6 +578,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     ) -> ParameterAdjoint | TracedAdjoint:
         """Return the derivatives of images of ``scene`` by the parameters ``keys``."""
         from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check, needs_paths
+        from mitsuba_irrcache.gradients.border_error import warn_of_dense_border
         from mitsuba_irrcache.gradients.traced import TracedAdjoint
 
         self._source.refuse_tolerance("an objective would jump with the resolution")
@@ -589,9 +591,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         check(parts, keys, rays.layered, traced)
         if traced:
             image = rays.step, rays.hide_emitters, emission
-            return TracedAdjoint(scene, params, keys, parts, image, seed)
-        image = camera_rays, rays.step, emission
-        return ParameterAdjoint(scene, params, keys, parts[0], image, seed)
+            adjoint = TracedAdjoint(scene, params, keys, parts, image, seed)
+        else:
+            image = camera_rays, rays.step, emission
+            adjoint = ParameterAdjoint(scene, params, keys, parts[0], image, seed)
+        if not self._has_warned_of_border:  # not in each step of an optimisation
+            self._has_warned_of_border = warn_of_dense_border(adjoint.parts_by_extinction)
+        return adjoint
 
     def to_string(self) -> str:
         """Return all properties with their values, to record how an image was computed."""

@@ -15,6 +15,7 @@ from mitsuba_irrcache.gradients.film import LANES, FilmAdjoint
 from mitsuba_irrcache.gradients.medium import MediumAdjoint, field_of, original_of
 from mitsuba_irrcache.gradients.parameters import (
     MEAN_COSINE,
+    SIGMA_T,
     Placement,
     by_parameter,
     channels_of,
@@ -146,6 +147,12 @@ class ParameterAdjoint:
             check_placements(self._placed, part.cache.grid)
         emitters = [role for role in roles.values() if isinstance(role, mi.Emitter)]
         self._emitters = EmitterAdjoint(scene, emitters)
+
+    @property
+    def parts_by_extinction(self) -> list[CachedMedium]:
+        """The medium if derivatives by its extinction are wanted."""
+        is_wanted = SIGMA_T in self._of_medium.values() and self._part.cache is not None
+        return [self._part] if is_wanted else []
 
     def view(self, film: FilmAdjoint) -> tuple[dict[str, object], list[mi.Float] | None]:
         """Return the derivatives of the objective of one view at fixed irradiance, and the adjoint

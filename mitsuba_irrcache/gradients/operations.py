@@ -17,17 +17,20 @@ import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import graph_variables
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.backward import ParameterAdjoint
 from mitsuba_irrcache.gradients.film import FilmAdjoint, FilmTangent
 from mitsuba_irrcache.gradients.medium import values_per_voxel
 from mitsuba_irrcache.gradients.parameters import enabled
 from mitsuba_irrcache.gradients.tangent import ImageTangent
+from mitsuba_irrcache.scene.fingerprint import SceneVersion, SensorVersion
 
 
 class DifferentiableIntegrator(Protocol):
     """The interface of the integrator that these operations use."""
 
     caches: dict[str, IrradianceCache | None]
+    emission: tuple[object, float]
 
     def render(
         self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, develop: bool, evaluate: bool
@@ -62,6 +65,7 @@ class SceneState:
     ) -> None:
         self.integrator, self.scene, self.params = integrator, scene, params
         self._identity, self._revision = _variables(params), integrator.revision(scene)
+        self._version = self._present_version
         caches = [cache for cache in integrator.caches.values() if cache is not None]
         counts = [cache.grid.voxel_count * values_per_voxel(cache) for cache in caches]
         #: number of values of the irradiance in each channel
@@ -83,6 +87,25 @@ class SceneState:
     @property
     def _is_current(self) -> bool:
         return self._revision == self.integrator.revision(self.scene)
+
+    @property
+    def _present_version(self) -> SceneVersion:
+        volume = self.integrator.emission[0]
+        return SceneVersion(self.scene, volume if isinstance(volume, mi.Volume) else None)
+
+    def refuse_changes(self, sensor: mi.Sensor, seen: SensorVersion) -> None:
+        """Raise an error if the scene, or the ``sensor`` of an image, which was ``seen`` then, has
+        changed since: derivatives would be those of another image.
+        """
+        changes = self._present_version.changes(self._version)
+        changes += SensorVersion(sensor).changes(seen)
+        if changes:
+            names = ", ".join(f'"{name}"' for name in changes[:4])
+            raise IrrcacheError(
+                f"irrcache: the scene has changed since the image was rendered ({names}), so that "
+                "its derivatives would be wrong; call dr.backward or dr.forward before the scene "
+                "is changed, and give each view a sensor of its own."
+            )
 
     def add_image(
         self, grad: mi.TensorXf, sensor: mi.Sensor, seed: int, spp: int
@@ -190,15 +213,19 @@ class Image(dr.CustomOp):
         spp: tuple[int, int],
     ) -> mi.TensorXf:
         self._shared, self._sensor, self._seed, self._spp = shared, sensor, seed[1], spp[1]
-        state = shared.state
+        state, self._seen = shared.state, SensorVersion(sensor)
         with dr.suspend_grad():
             return state.integrator.render(state.scene, sensor, seed[0], spp[0], True, False)
 
     def forward(self) -> None:
-        self.set_grad_out(self._shared.state.image_along(self._sensor, self._seed, self._spp))
+        state = self._shared.state
+        state.refuse_changes(self._sensor, self._seen)
+        self.set_grad_out(state.image_along(self._sensor, self._seed, self._spp))
 
     def backward(self) -> None:
-        found = self._shared.state.add_image(self.grad_out(), self._sensor, self._seed, self._spp)
+        state = self._shared.state
+        state.refuse_changes(self._sensor, self._seen)
+        found = state.add_image(self.grad_out(), self._sensor, self._seed, self._spp)
         # Dr.Jit visits the irradiance only if it has a gradient.
         self.set_grad_in("irradiance", mi.Spectrum(0) if found is None else found)
 

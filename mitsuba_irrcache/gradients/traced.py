@@ -17,6 +17,7 @@ from mitsuba_irrcache.gradients.medium import field_of, original_of
 from mitsuba_irrcache.gradients.parameters import (
     EMISSION,
     MEAN_COSINE,
+    SIGMA_T,
     add_user,
     by_parameter,
     channels_of,
@@ -124,6 +125,13 @@ class TracedAdjoint:
             if isinstance(role, tuple):
                 number, name = role
                 check_role(key, name, parts[number].medium)
+
+    @property
+    def parts_by_extinction(self) -> list[CachedMedium]:
+        """The media by whose extinction derivatives are wanted."""
+        roles = [role for role in self._roles.values() if isinstance(role, tuple)]
+        numbers = sorted({number for number, name in roles if name == SIGMA_T})
+        return [part for part in map(self._parts.__getitem__, numbers) if part.cache is not None]
 
     def view(self, film: FilmAdjoint) -> tuple[dict[str, object], list[mi.Float] | None]:
         """Return derivatives and adjoint fluence as `ParameterAdjoint.view`; the fluence of all

@@ -1,4 +1,6 @@
-"""Inputs of a cache, compared by identity in a process (`SceneVersion`), in files by `digests`."""
+"""Inputs of a cache, compared by identity in a process (`SceneVersion`), in files by `digests`; and
+those of an image (`SensorVersion`).
+"""
 
 from __future__ import annotations
 
@@ -86,13 +88,33 @@ class SceneVersion:
 
     def changes(self, other: SceneVersion) -> list[str]:
         """Return names of differing parameters, and classes of objects that only one has."""
-        mine, theirs = self._values, other._values
-        names = [k for k in mine.keys() | theirs.keys() if mine.get(k) != theirs.get(k)]
+        names = _different(self._values, other._values)
         return sorted({*names, *(node.class_name() for node in self._objects ^ other._objects)})
 
     def shares_objects_with(self, other: SceneVersion) -> bool:
         """Return whether both belong to the same scene, or to scenes that share objects."""
         return not self._objects.isdisjoint(other._objects)
+
+
+class SensorVersion:
+    """Parameters of a sensor and of its film at one time, like those of a `SceneVersion`."""
+
+    def __init__(self, sensor: mi.Sensor) -> None:
+        entries, budget = mi.traverse(sensor).properties, _Budget(SMALL_IN_ALL)
+        self._values = {
+            key: _kept(_value(entry), None, budget)
+            for key, entry in entries.items()
+            if not isinstance(entry[2], mi.Sampler)
+        }
+
+    def changes(self, other: SensorVersion) -> list[str]:
+        """Return the names of differing parameters."""
+        return sorted(_different(self._values, other._values))
+
+
+def _different(mine: dict[str, Any], theirs: dict[str, Any]) -> list[str]:
+    """Return the keys whose values differ, or that only one has."""
+    return [key for key in mine.keys() | theirs.keys() if mine.get(key) != theirs.get(key)]
 
 
 def values_of(value: Any) -> np.ndarray:

@@ -343,23 +343,88 @@ def test_an_image_without_weight_does_not_hide_others(rgb):
     assert np.array(dr.grad(params[key])).tobytes() == expected.tobytes()
 
 
-def test_a_scene_edited_before_the_backward_pass_is_differentiated_as_it_is(rgb):
-    """As by Mitsuba's integrators; nothing of the earlier state is used."""
+def edited_data(scene: mi.Scene, params: mi.SceneParameters, key: str) -> None:
+    params[key] = mi.TensorXf(0.5 * dr.detach(params[key]))
+    dr.enable_grad(params[key])
+
+
+def moved_camera(scene: mi.Scene, params: mi.SceneParameters, key: str) -> None:
+    turned = mi.Transform4f().rotate([0, 1, 0], 30)
+    params["sensor.to_world"] = turned @ params["sensor.to_world"]
+
+
+def smaller_film(scene: mi.Scene, params: mi.SceneParameters, key: str) -> None:
+    params["sensor.film.size"] = [8, 8]
+
+
+def brighter_light(scene: mi.Scene, params: mi.SceneParameters, key: str) -> None:
+    name = next(k for k in params.keys() if k.endswith(("radiance.value", "irradiance.value")))
+    params[name] = 2 * params[name]
+
+
+@pytest.mark.parametrize("forward", [False, True])
+@pytest.mark.parametrize("edit", [edited_data, moved_camera, smaller_film, brighter_light])
+def test_a_scene_edited_before_its_image_is_differentiated_is_refused(rgb, edit, forward):
+    """The derivatives would be those of another image, as they are with Mitsuba's integrators."""
     scene, params, key = small()
-    data = mi.TensorXf(dr.detach(params[key]))
-    params[key] = 0.5 * data
+    attached(params, key)
+    variable = params[key]
+    image = mi.render(scene, params, spp=4, seed=1)
+    edit(scene, params, key)
     params.update()
-    expected = gradient_of(scene, params, key, seed=1, spp=64)
-    params[key] = data
+    with pytest.raises(IrrcacheError, match="has changed since the image was rendered"):
+        if forward:
+            dr.set_grad(variable, 1)
+            dr.forward_to(image)
+        else:
+            dr.backward(loss_of(image))
+
+
+def test_other_images_and_edits_that_are_undone_do_not_matter(rgb):
+    """Images of other scenes by the same integrator, and with other values, may lie between an
+    image and its gradients.
+    """
+    scene, params, key = small()
+    expected = gradient_of(scene, params, key, seed=1)
     attached(params, key)
-    image = mi.render(scene, params, spp=64, seed=1)
-    params[key] = mi.TensorXf(0.5 * data)
-    attached(params, key)
-    later = dr.detach(mi.render(scene, params, spp=64, seed=1))
-    # The derivative of the loss by the pixels at the later image.
-    dr.backward(dr.sum(image * (2 / np.prod(later.shape)) * (later - 0.3)))
-    found = np.array(dr.grad(params[key]))
-    np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-3 * np.abs(found).max())
+    image, variable = mi.render(scene, params, spp=4, seed=1), mi.TensorXf(params[key])
+    other = small()[0]
+    mi.render(other, integrator=scene.integrator(), spp=1)
+    params[key] = mi.TensorXf(0.5 * dr.detach(variable))
+    params.update()
+    mi.render(scene, spp=1)
+    params[key] = variable
+    params.update()
+    dr.backward(loss_of(image))
+    found = np.array(dr.grad(variable))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("data", "parameter", "expected"),
+    [("dense at its boundary", "sigma_t", True), ("dense at its boundary", "albedo", False),
+     ("empty at its boundary", "sigma_t", False)],
+)  # fmt: skip
+def test_inaccurate_derivatives_at_dense_boundaries_are_warned_of(
+    rgb, scenes, logged, data, parameter, expected
+):
+    values = np.zeros((8, 8, 8), np.float32)
+    inside = slice(None) if data == "dense at its boundary" else slice(2, 6)
+    values[inside, inside, inside] = 1.5
+    to_world = scenes.placement()
+    shape = scenes.boundary(scenes.medium(values, 0.9, to_world), to_world)
+    integrator = {"type": "irrcache", "solver": "sweep", "resolution": 8}
+    scene = scenes.load(integrator, shape, 4, emitter=scenes.sun)
+    params = mi.traverse(scene)
+    key = first_key(params, parameter)
+    value = params[key]
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    for _ in range(2):
+        dr.backward(loss_of(mi.render(scene, params, spp=4)))
+    warnings = [text for text in logged if "derivatives by its extinction" in text]
+    assert len(warnings) == expected
 
 
 def test_images_with_gradients_do_not_keep_the_scene(rgb):

@@ -1,0 +1,64 @@
+"""Error of derivatives by the extinction of media that are dense at an illuminated boundary.
+
+What the extinction removes on the way from a light is summed voxel by voxel, with the length of the
+way to the middle of the voxel. Where light of a sun or a point-like emitter enters through a dense
+face of the medium, the irradiance varies so much within the outermost voxels that this is
+inaccurate, in particular at grazing incidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
+from mitsuba_irrcache.solvers.grid_size import border_depth
+
+#: Error of the derivative of an image by the logarithm of the extinction, in % of the radiance:
+#: BORDER_ERROR d^BORDER_ORDER, with the optical depth d of an outermost voxel along the light, at
+#: most DEEPEST, beyond which little light passes the voxel. Found with cubes of optical depth 3 and
+#: 10 and 12 to 48 voxels, under suns of 1, 0.7 and 0.27 of normal incidence. A warning is logged
+#: above LARGE_ERROR.
+BORDER_ERROR, BORDER_ORDER, DEEPEST, LARGE_ERROR = 4.5, 1.5, 1.5, 0.5
+
+
+def warn_of_dense_border(parts: Iterable[CachedMedium]) -> bool:
+    """Log a warning if derivatives by the extinction of one of the media are inaccurate; return
+    whether it was logged.
+    """
+    for part in parts:
+        depth, light = _largest_depth(part)
+        error = BORDER_ERROR * min(depth, DEEPEST) ** BORDER_ORDER
+        if error > LARGE_ERROR:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'irrcache: medium "{part.medium.name}" is dense at its boundary (optical depth '
+                f'{depth:.2g} of an outermost voxel along the light of "{light}"): derivatives '
+                f"by its extinction have errors of about {error:.1f} % of the radiance. Raise "
+                "resolution, or leave empty voxels around the matter.",
+            )
+            return True
+    return False
+
+
+def _largest_depth(part: CachedMedium) -> tuple[float, str]:
+    """Return the largest optical depth of a voxel at a face along the light that enters there, and
+    the name of the emitter; 0 without such light.
+    """
+    grid, found = part.cache.grid, (0.0, "")
+    depth = border_depth(part.medium, grid)
+    # Columns are the normals of the faces.
+    normals = np.linalg.inv(grid.to_world[:3, :3]).T
+    normals = normals / np.linalg.norm(normals, axis=0)
+    centre = dr.zeros(mi.Interaction3f)
+    centre.p = mi.Point3f(*(grid.to_world @ [0.5, 0.5, 0.5, 1.0])[:3].tolist())
+    for emitter in part.description.emitters.of(EmitterKind.SUN, *POINT_LIKE):
+        record, _ = emitter.sample_direction(centre, mi.Point2f(0.5))
+        cosines = np.abs(normals.T @ np.array(record.d).ravel())
+        along = depth / cosines[cosines > 1e-3]
+        found = max(found, (float(along.max()), emitter.id()))
+    return found
