@@ -596,7 +596,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             image = camera_rays, rays.step, emission
             adjoint = ParameterAdjoint(scene, params, keys, parts[0], image, seed)
         if not self._has_warned_of_border:  # not in each step of an optimisation
-            self._has_warned_of_border = warn_of_dense_border(adjoint.parts_by_extinction)
+            parts = adjoint.parts_by_extinction
+            self._has_warned_of_border = warn_of_dense_border(parts, divides=not traced)
         return adjoint
 
     def to_string(self) -> str:

@@ -55,8 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="number of images at the end that are held out to measure the error (default: 0)",
     )  # fmt: skip
     _add_settings(parser)
-    parser.add_argument(
+    earlier = parser.add_mutually_exclusive_group()
+    earlier.add_argument(
         "--resume", action="store_true", help=f"continue from {CHECKPOINT} in the output folder"
+    )
+    earlier.add_argument(
+        "--overwrite", action="store_true", help="replace an earlier fit in the output folder"
     )
     parser.add_argument(
         "-i", "--integrator", metavar="NAME{KEY=VALUE,...}",
@@ -110,6 +114,12 @@ def run(args: argparse.Namespace) -> int:
     files = _image_files(args.images)
     shared = {name: getattr(args, name) for name in Settings.__dataclass_fields__}
     settings, output = Settings(**shared), Path(args.output)
+    checkpoint = output / CHECKPOINT
+    if checkpoint.exists() and not (args.resume or args.overwrite):
+        raise IrrcacheError(
+            f'"{output}" already holds a fit ({CHECKPOINT}); continue it with --resume, name '
+            "another folder, or add --overwrite."
+        )
     select_variant(args.mode)
     mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
     parameters = parse_parameters(args.define)
@@ -130,7 +140,6 @@ def run(args: argparse.Namespace) -> int:
             f"--held-out is {args.held_out} of {len(views)} image(s); leave at least one to fit."
         )
     _make_folder(output)
-    checkpoint = output / CHECKPOINT
     start = Result.load(checkpoint, settings) if args.resume else None
     report = _Report(checkpoint, settings)
     try:

@@ -3,7 +3,8 @@
 What the extinction removes on the way from a light is summed voxel by voxel, with the length of the
 way to the middle of the voxel. Where light of a sun or a point-like emitter enters through a dense
 face of the medium, the irradiance varies so much within the outermost voxels that this is
-inaccurate, in particular at grazing incidence.
+inaccurate, in particular at grazing incidence. There, voxels are divided, and steps along camera
+rays are as short as their parts.
 """
 
 from __future__ import annotations
@@ -18,21 +19,30 @@ from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.solvers.grid_size import border_depth
 
+#: Optical depth of an outermost voxel along the light above which voxels are divided, and the
+#: number of their parts along each axis; among surfaces and with several media they are not.
+DIVIDED, PARTS = 0.15, 2
 #: Error of the derivative of an image by the logarithm of the extinction, in % of the radiance:
-#: BORDER_ERROR d^BORDER_ORDER, with the optical depth d of an outermost voxel along the light, at
-#: most DEEPEST, beyond which little light passes the voxel. Found with cubes of optical depth 3 and
-#: 10 and 12 to 48 voxels, under suns of 1, 0.7 and 0.27 of normal incidence. A warning is logged
-#: above LARGE_ERROR.
-BORDER_ERROR, BORDER_ORDER, DEEPEST, LARGE_ERROR = 4.5, 1.5, 1.5, 0.5
+#: factor d^order, with that depth d, at most DEEPEST, beyond which little light passes the voxel;
+#: without and with division of the voxels. Found with cubes of optical depth 3 and 10 and 12 to 48
+#: voxels, under suns of 1, 0.7 and 0.27 of normal incidence. A warning is logged above LARGE_ERROR.
+WHOLE_VOXELS, DIVIDED_VOXELS = (4.5, 1.5), (1.7, 1.3)
+DEEPEST, LARGE_ERROR = 1.5, 0.5
 
 
-def warn_of_dense_border(parts: Iterable[CachedMedium]) -> bool:
+def is_dense_at_lit_border(part: CachedMedium) -> bool:
+    """Return whether `PARTS` of voxels along each axis are needed."""
+    return part.cache is not None and _largest_depth(part)[0] > DIVIDED
+
+
+def warn_of_dense_border(parts: Iterable[CachedMedium], divides: bool) -> bool:
     """Log a warning if derivatives by the extinction of one of the media are inaccurate; return
-    whether it was logged.
+    whether it was logged. ``divides`` states that voxels are divided where it is needed.
     """
+    factor, order = DIVIDED_VOXELS if divides else WHOLE_VOXELS
     for part in parts:
         depth, light = _largest_depth(part)
-        error = BORDER_ERROR * min(depth, DEEPEST) ** BORDER_ORDER
+        error = factor * min(depth, DEEPEST) ** order
         if error > LARGE_ERROR:
             mi.Log(
                 mi.LogLevel.Warn,

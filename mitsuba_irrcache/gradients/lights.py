@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import product
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mitsuba_irrcache.core.jit import opaque_point
 from mitsuba_irrcache.gradients.scattering import Components, IsotropicScattering, OrdinatePart
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import suns
@@ -15,6 +18,9 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
 from mitsuba_irrcache.transport.tracking import medium_transmittance
+
+#: Smallest transmittance to the middle of a voxel for which there is light in it.
+DARK = 1e-30
 
 
 class LightsOfOneDirection:
@@ -49,7 +55,7 @@ class LightsOfOneDirection:
         self.irradiance = [irradiance * self.spread for irradiance in self.at_positions]
         dr.eval(self.at_positions, self.irradiance)
         self.parts = scattering.point_parts(self.points)
-        self._medium = medium
+        self._medium, self._grid = medium, grid
 
     def add_suns(self, ordinates: Ordinates, parts: Sequence[OrdinatePart], pairs: int) -> None:
         """Compute the irradiance of the suns, whose ``pairs`` of ordinates are the last ones."""
@@ -69,18 +75,38 @@ class LightsOfOneDirection:
 
     def towards(self, light: int) -> mi.Vector3f:
         """Return the direction from each voxel to an emitter, given its index."""
-        return self._record(light).d
+        return self._record(light, self.positions).d
 
     def transmittance(self, light: int) -> mi.Spectrum:
-        """Return the transmittance of the medium between each voxel and a point or spot."""
-        record = self._record(light)
-        ray = mi.Ray3f(self.positions, record.d)
-        through = medium_transmittance(self._medium, ray, record.dist, mi.Bool(True))
+        """Return the transmittance of the medium between each voxel and an emitter."""
+        return self._transmittance(light, self.positions)
+
+    def ways(self, light: int, parts: int) -> Iterator[tuple[mi.Point3f, mi.Spectrum]]:
+        """Yield positions in all voxels, ``parts`` along each of their axes, and the share of each
+        in the irradiance of the voxel, per unit of that in its middle.
+        """
+        if parts == 1:
+            yield self.positions, mi.Spectrum(dr.opaque(mi.Float, 1, dr.width(self.positions)))
+            return
+        middle = self.transmittance(light)
+        per_middle = dr.select(middle > DARK, dr.rcp(dr.maximum(middle, DARK)), 0) / parts**3
+        edges = self._grid.to_world[:3, :3] / self._grid.resolution
+        for place in product((np.arange(parts) + 0.5) / parts - 0.5, repeat=3):
+            p = self.positions + mi.Vector3f(opaque_point(edges @ place))
+            share = self._transmittance(light, p) * per_middle
+            dr.eval(p, share)
+            yield p, share
+
+    def _transmittance(self, light: int, p: mi.Point3f) -> mi.Spectrum:
+        record = self._record(light, p)
+        through = medium_transmittance(
+            self._medium, mi.Ray3f(p, record.d), record.dist, mi.Bool(True)
+        )
         return mi.Spectrum(through)
 
-    def _record(self, light: int) -> mi.DirectionSample3f:
-        at = dr.zeros(mi.Interaction3f, dr.width(self.positions))
-        at.p = self.positions
+    def _record(self, light: int, p: mi.Point3f) -> mi.DirectionSample3f:
+        at = dr.zeros(mi.Interaction3f, dr.width(p))
+        at.p = p
         return self.emitters[light].sample_direction(at, mi.Point2f(0.5))[0]
 
     def derivative(self, light: int, direct: list[list[Components]]) -> mi.Spectrum:

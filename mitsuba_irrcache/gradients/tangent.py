@@ -78,16 +78,13 @@ class ImageTangent:
     def _depth_to_light(self, light: int) -> mi.Spectrum:
         """Return the change of the optical depth between all voxels and an emitter."""
         adjoint, lights = self._adjoint, self._adjoint.transport.lights
-        voxels = adjoint.grid.voxel_count
-        reader = add_paths_to_light(
-            adjoint.medium,
-            lights.emitters[light],
-            lights.positions,
-            mi.Spectrum(dr.opaque(mi.Float, 1, voxels)),
-            adjoint.march.step,
-            FieldReader(mi.Spectrum(dr.zeros(mi.Float, voxels)), self._fields[SIGMA_T]),
+        reader = FieldReader(
+            mi.Spectrum(dr.zeros(mi.Float, adjoint.grid.voxel_count)), self._fields[SIGMA_T]
         )
-        dr.eval(reader.total)
+        emitter, step = lights.emitters[light], adjoint.march.step
+        for p, share in lights.ways(light, adjoint.parts):
+            reader = add_paths_to_light(adjoint.medium, emitter, p, share, step, reader)
+            dr.eval(reader.total)
         return reader.total
 
     def image(self, film: FilmTangent) -> mi.TensorXf:

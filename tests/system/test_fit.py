@@ -323,6 +323,14 @@ def test_the_command_fits_and_continues(folder, capsys):
     (folder / "out" / "sigma_t.vol").unlink()
     assert main([*common, "--resume"]) == 0
     np.testing.assert_array_equal(read_vol(folder / "out" / "sigma_t.vol")[0], values)
+    # Another fit does not replace it unasked.
+    capsys.readouterr()
+    other = [*common, "--steps", "1"]
+    assert main(other) == 1
+    assert "already holds a fit (fit.npz); continue it with --resume" in capsys.readouterr().err
+    np.testing.assert_array_equal(read_vol(folder / "out" / "sigma_t.vol")[0], values)
+    assert main([*other, "--overwrite"]) == 0
+    assert (read_vol(folder / "out" / "sigma_t.vol")[0] != values).any()
 
 
 def test_images_of_a_folder_are_sorted_by_numbers(tmp_path):
