@@ -23,6 +23,7 @@ from mitsuba_irrcache.io.display import TONES, Display, linear_colour
 from mitsuba_irrcache.io.images import check_output, write_image
 from mitsuba_irrcache.io.scene_files import (
     check_scene_file,
+    check_sensor,
     has_cache,
     integrator_of,
     load_scene,
@@ -143,11 +144,7 @@ def run(args: argparse.Namespace) -> int:
             _check_tolerance(used, args)
             properties["tolerance"] = args.tolerance
         scene = load_scene(source, parameters, integrator, properties)
-    if not 0 <= args.sensor < len(scene.sensors()):
-        raise IrrcacheError(
-            f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), "
-            "counted from 0."
-        )
+    check_sensor(args.sensor, scene)
     if integrator is None and used != "irrcache":
         print(
             f'irrcache: the scene\'s own integrator "{used}" renders the image; '

@@ -18,8 +18,9 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.errors import IrrcacheError, original_message
+from mitsuba_irrcache.errors import original_message
 from mitsuba_irrcache.io.images import write_image
+from mitsuba_irrcache.io.scene_files import check_sensor
 from mitsuba_irrcache.machine.modules import import_modules
 from mitsuba_irrcache.machine.variants import select_variant
 
@@ -43,11 +44,7 @@ def check(job: dict) -> None:
     described = {}
     for integrator in job["integrators"]:
         scene = _subject(job, integrator).load()
-        if not 0 <= job["sensor"] < len(scene.sensors()):
-            raise IrrcacheError(
-                f"--sensor is {job['sensor']}, but the scene has {len(scene.sensors())} sensor(s), "
-                "counted from 0."
-            )
+        check_sensor(job["sensor"], scene)
         film = scene.sensors()[job["sensor"]].film()
         described[integrator] = _described(scene.integrator())
     write_json(

@@ -15,7 +15,7 @@ from mitsuba_irrcache.cli.render import chosen_integrator
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.jobs import Environment, Job, caches_of, scene_arguments
 from mitsuba_irrcache.farm.results import Results
-from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.io.scene_files import load_scene, sensor_count
 
 #: Largest number of frames of one run; more are most likely a mistake, such as 0:1:1e9.
 MOST_FRAMES = 1_000_000
@@ -169,7 +169,7 @@ def frame_jobs(
         )
     chosen = chosen_integrator(scene, parameters | rows[0], integrator)
     loaded = load_scene(scene, parameters | rows[0], chosen)
-    sensors = sensors_of(args.sensors, len(loaded.sensors()))
+    sensors = sensors_of(args.sensors, sensor_count(loaded))
     digits = max(4, len(str(len(rows) - 1)))
     for number, row in enumerate(rows):
         chosen = chosen_integrator(scene, parameters | row, integrator)

@@ -29,6 +29,7 @@ from mitsuba_irrcache.farm.studies import SceneStudy, arguments_by_scene
 from mitsuba_irrcache.farm.volume import NAMES, FarmSweep
 from mitsuba_irrcache.io.scene_files import (
     check_scene_file,
+    check_sensor,
     load_scene,
     parse_integrator,
     parse_parameters,
@@ -272,11 +273,7 @@ def _reference(
     """
     require_emission(scene, parameters, args.reference)
     arguments = scene_arguments(scene, parameters, args.reference)
-    available = len(load_scene(scene, parameters, args.reference).sensors())
-    if args.sensor >= available:
-        raise IrrcacheError(
-            f"--sensor is {args.sensor}, but the scene has {available} sensor(s), counted from 0."
-        )
+    check_sensor(args.sensor, load_scene(scene, parameters, args.reference))
     folder = (args.references or default_folder()).resolve()
     path = reference_path(scene, parameters, args.reference, args.sensor, folder)
     if path in known:

@@ -30,7 +30,7 @@ WHOLE_VOXELS, DIVIDED_VOXELS = (4.5, 1.5), (1.7, 1.3)
 DEEPEST, LARGE_ERROR = 1.5, 0.5
 
 
-def is_dense_at_lit_border(part: CachedMedium) -> bool:
+def is_dense_at_illuminated_border(part: CachedMedium) -> bool:
     """Return whether `PARTS` of voxels along each axis are needed."""
     return part.cache is not None and _largest_depth(part)[0] > DIVIDED
 

@@ -19,8 +19,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordin
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
-#: Smallest transmittance to the middle of a voxel for which there is light in it.
-DARK = 1e-30
+#: Transmittance between a light and the middle of a voxel below which its irradiance counts as 0.
+OPAQUE = 1e-30
 
 
 class LightsOfOneDirection:
@@ -81,15 +81,16 @@ class LightsOfOneDirection:
         """Return the transmittance of the medium between each voxel and an emitter."""
         return self._transmittance(light, self.positions)
 
-    def ways(self, light: int, parts: int) -> Iterator[tuple[mi.Point3f, mi.Spectrum]]:
-        """Yield positions in all voxels, ``parts`` along each of their axes, and the share of each
-        in the irradiance of the voxel, per unit of that in its middle.
+    def positions_within(self, light: int, parts: int) -> Iterator[tuple[mi.Point3f, mi.Spectrum]]:
+        """Yield one position in every voxel after the other, ``parts`` along each of its axes; and
+        the irradiance there over that in the middle of the voxel and the number of positions.
         """
+        # docs/primer, below eq. (8.9)
         if parts == 1:
             yield self.positions, mi.Spectrum(dr.opaque(mi.Float, 1, dr.width(self.positions)))
             return
         middle = self.transmittance(light)
-        per_middle = dr.select(middle > DARK, dr.rcp(dr.maximum(middle, DARK)), 0) / parts**3
+        per_middle = dr.select(middle > OPAQUE, dr.rcp(dr.maximum(middle, OPAQUE)), 0) / parts**3
         edges = self._grid.to_world[:3, :3] / self._grid.resolution
         for place in product((np.arange(parts) + 0.5) / parts - 0.5, repeat=3):
             p = self.positions + mi.Vector3f(opaque_point(edges @ place))

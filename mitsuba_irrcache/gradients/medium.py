@@ -8,7 +8,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import concatenated
-from mitsuba_irrcache.gradients.border_error import PARTS, is_dense_at_lit_border
+from mitsuba_irrcache.gradients.border_error import PARTS, is_dense_at_illuminated_border
 from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
 from mitsuba_irrcache.gradients.film import CameraPass, FilmAdjoint
 from mitsuba_irrcache.gradients.fluence import FluenceFields
@@ -104,9 +104,9 @@ class MediumAdjoint:
         self._scene, self._part, self._wanted = scene, part, wanted
         self._camera_rays, step = image
         self.medium, self._emitters = part.medium, emitters
-        #: number of parts of a voxel along each axis from which there are ways to lights
+        #: number of positions in a voxel along each axis from which there are paths to lights
         self.parts = 1
-        if SIGMA_T in wanted and is_dense_at_lit_border(part):
+        if SIGMA_T in wanted and is_dense_at_illuminated_border(part):
             self.parts, step = PARTS, step / PARTS
         #: emitters with respect to whose position or direction there are derivatives
         self.placements: list[Placement] = []
@@ -355,14 +355,19 @@ class MediumAdjoint:
         several = dr.size_v(mi.Spectrum) // self.transport.channels
         share = dr.opaque(mi.Float, -volume_of(grid) / several)
         removed = lights.irradiance[light] * lights.derivative(light, found.direct) * share
-        ways = [(p, removed * own) for p, own in lights.ways(light, self.parts)]
-        dr.eval(ways)
+        dr.eval(removed)
+        # Compute the positions twice: together they would take much memory.
+        largest = sum(
+            float(dr.max(dr.max(dr.abs(removed * own)))[0])
+            for _, own in lights.positions_within(light, self.parts)
+        )
         diagonal = float(np.linalg.norm(grid.side_lengths))
-        largest = sum(float(dr.max(dr.max(dr.abs(own)))[0]) for _, own in ways)
         bound = largest * grid.voxel_count * diagonal * 3
         splat, emitter = self._splat(SIGMA_T, bound * MARGIN), lights.emitters[light]
-        for p, own in ways:
-            add_paths_to_light(self.medium, emitter, p, own, self.march.step, splat)
+        for p, own in lights.positions_within(light, self.parts):
+            change = removed * own
+            dr.eval(change)
+            add_paths_to_light(self.medium, emitter, p, change, self.march.step, splat)
         return splat.values()
 
 

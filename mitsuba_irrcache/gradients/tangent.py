@@ -82,7 +82,7 @@ class ImageTangent:
             mi.Spectrum(dr.zeros(mi.Float, adjoint.grid.voxel_count)), self._fields[SIGMA_T]
         )
         emitter, step = lights.emitters[light], adjoint.march.step
-        for p, share in lights.ways(light, adjoint.parts):
+        for p, share in lights.positions_within(light, adjoint.parts):
             reader = add_paths_to_light(adjoint.medium, emitter, p, share, step, reader)
             dr.eval(reader.total)
         return reader.total

@@ -374,6 +374,23 @@ def _search_path(*folders: str | Path) -> Iterator[None]:
         mi.set_file_resolver(saved)
 
 
+def sensor_count(scene: mi.Scene) -> int:
+    """Return the number of sensors of a scene; raise IrrcacheError if it is 0."""
+    count = len(scene.sensors())
+    if not count:
+        raise IrrcacheError("the scene has no sensor; add a <sensor> to it.")
+    return count
+
+
+def check_sensor(number: int, scene: mi.Scene) -> None:
+    """Raise IrrcacheError if the scene has no sensor of this ``number``, the value of --sensor."""
+    count = sensor_count(scene)
+    if not 0 <= number < count:
+        raise IrrcacheError(
+            f"--sensor is {number}, but the scene has {count} sensor(s), counted from 0."
+        )
+
+
 def has_cache(scene: mi.Scene) -> bool:
     """Return whether the scene's integrator builds a cache before rendering."""
     method = getattr(scene.integrator(), "prepare", None)

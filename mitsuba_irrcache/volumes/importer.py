@@ -527,7 +527,8 @@ def _summary(
         f"source         {volume.source}",
         f"size           {size} voxels of {spacing}, {extent} in all{length}",
         f"values         {values.min():.6g} .. {values.max():.6g}{unit}",
-        f"sigma_t        0 .. {sigma_t.max():.4g} per unit length, {empty:.1%} of voxels empty",
+        f"sigma_t        {sigma_t.min():.4g} .. {sigma_t.max():.4g} per unit length, "
+        f"{empty:.1%} of voxels empty",
         f"albedo         {albedo.min():.3g} .. {albedo.max():.3g}",
         "optical depth  at most " + ", ".join(f"{d:.3g}" for d in depths) + " along x, y, z",
         f"written        {written / 1e6:,.2f} MB to {output}",

@@ -296,8 +296,8 @@ def _check_medium(volume: VolumeData, sigma_t: np.ndarray, albedo: np.ndarray) -
         raise IrrcacheError(f"extinction from {low:g} to {high:g}; it must be finite and >= 0")
     if high == 0:
         raise IrrcacheError(
-            f"the whole medium is empty: the values of {volume.source!r} lie where the transfer "
-            "function is transparent; check its unit, or rescale the values"
+            f"the whole medium is empty: all values of {volume.source!r} are 0, or lie where the "
+            "transfer function is transparent; check its unit, or rescale the values"
         )
     low, high = float(albedo.min()), float(albedo.max())
     if not (low >= 0 and high <= 1):

@@ -8,6 +8,7 @@ import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.scene_files import (
+    check_sensor,
     integrator_of,
     key_of,
     load_scene,
@@ -210,3 +211,14 @@ def test_keys_are_abbreviated(file):
         key_of(params, "value")
     with pytest.raises(IrrcacheError, match="found: none"):
         key_of(params, "function.g")
+
+
+def test_scenes_without_a_sensor_are_refused():
+    sensor = {"type": "perspective"}
+    with pytest.raises(IrrcacheError, match="the scene has no sensor; add a <sensor>"):
+        check_sensor(0, mi.load_dict({"type": "scene"}))
+    scene = mi.load_dict({"type": "scene", "a": sensor, "b": sensor})
+    check_sensor(1, scene)
+    for number in (-1, 2):
+        with pytest.raises(IrrcacheError, match=rf"--sensor is {number}, but the scene has 2"):
+            check_sensor(number, scene)
