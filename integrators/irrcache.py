@@ -578,7 +578,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     ) -> ParameterAdjoint | TracedAdjoint:
         """Return the derivatives of images of ``scene`` by the parameters ``keys``."""
         from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check, needs_paths
-        from mitsuba_irrcache.gradients.border_error import warn_of_dense_border
+        from mitsuba_irrcache.gradients.border_error import warn_of_border_error
         from mitsuba_irrcache.gradients.traced import TracedAdjoint
 
         self._source.refuse_tolerance("an objective would jump with the resolution")
@@ -597,7 +597,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             adjoint = ParameterAdjoint(scene, params, keys, parts[0], image, seed)
         if not self._has_warned_of_border:  # not in each step of an optimisation
             parts = adjoint.parts_by_extinction
-            self._has_warned_of_border = warn_of_dense_border(parts, divides=not traced)
+            self._has_warned_of_border = warn_of_border_error(parts, divides=not traced)
         return adjoint
 
     def to_string(self) -> str:

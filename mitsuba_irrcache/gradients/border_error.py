@@ -35,7 +35,7 @@ def is_dense_at_illuminated_border(part: CachedMedium) -> bool:
     return part.cache is not None and _largest_depth(part)[0] > DIVIDED
 
 
-def warn_of_dense_border(parts: Iterable[CachedMedium], divides: bool) -> bool:
+def warn_of_border_error(parts: Iterable[CachedMedium], divides: bool) -> bool:
     """Log a warning if derivatives by the extinction of one of the media are inaccurate; return
     whether it was logged. ``divides`` states that voxels are divided where it is needed.
     """
