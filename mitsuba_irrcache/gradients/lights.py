@@ -66,9 +66,7 @@ class LightsOfOneDirection:
             first = self.even + number * self.sun_tracks
             entering = ordinates.incoming[first : first + self.sun_tracks].sum(axis=(0, 1))
             values = mi.Spectrum(*(dr.opaque(mi.Float, float(v)) for v in entering))
-            ray = mi.Ray3f(self.positions, self.towards(self.points + number))
-            through = medium_transmittance(self._medium, ray, mi.Float(dr.inf), mi.Bool(True))
-            self.irradiance.append(values * mi.Spectrum(through))
+            self.irradiance.append(values * self.transmittance(self.points + number))
             own = (n for n, part in enumerate(parts) if part.receives(first))
             self.parts.append(next(own, 0))
         dr.eval(self.irradiance)
