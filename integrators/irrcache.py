@@ -597,7 +597,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             adjoint = ParameterAdjoint(scene, params, keys, parts[0], image, seed)
         if not self._has_warned_of_border:  # not in each step of an optimisation
             parts = adjoint.parts_by_extinction
-            self._has_warned_of_border = warn_of_border_error(parts, divides=not traced)
+            self._has_warned_of_border = warn_of_border_error(parts, isolated=not traced)
         return adjoint
 
     def to_string(self) -> str:

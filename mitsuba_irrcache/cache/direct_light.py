@@ -434,7 +434,7 @@ class DirectLightAlongRays:
         """``basis`` is None for isotropic scattering. For anisotropic scattering, ``moments`` are
         those of the radiance from all emitters with extent (see `area_light.moments_of`).
         """
-        self._light, self._basis, self._moments = light, basis, moments
+        self.light, self._basis, self._moments = light, basis, moments
 
     def _gain(
         self,
@@ -448,7 +448,7 @@ class DirectLightAlongRays:
         ``with_peak`` and ``peak_depth`` are as in `AngularField.factor`.
         """
         # docs/primer, eq. (2.12)
-        light, basis = self._light, self._basis
+        light, basis = self.light, self._basis
         if light.has_one_direction:
             gain = basis.gain(p, direction, light.towards(p), with_peak)
             if peak_depth is None or not basis.phase.forward:
@@ -477,7 +477,7 @@ class DirectLightAlongRays:
         towards the camera along ``direction``, averaged over the emitter; ``with_peak`` and
         ``peak_depth`` are as in `AngularField.factor`.
         """
-        light = self._light
+        light = self.light
         passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active)
         if self._basis is not None:
             passed = passed * self._gain(p, direction, with_peak, peak_depth)
@@ -485,7 +485,7 @@ class DirectLightAlongRays:
 
     def mean_extinction(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
         """Return the mean extinction between world positions and the emitter."""
-        return self._light.extinction.at_world(p, active)
+        return self.light.extinction.at_world(p, active)
 
     def scattered(
         self,
@@ -523,7 +523,7 @@ class DirectLightAlongRays:
         """
         # docs/primer, eq. (2.6)
         ray, (a, b), extinctions, means, _, albedo = segment
-        light = self._light
+        light = self.light
         near, far = (extinction * (b - a) for extinction in extinctions)
         depth_at = light.depth_along(ray, (a, b), means)
         total, u, passed = mi.Spectrum(0), mi.Float(0), 0 * near
@@ -576,7 +576,7 @@ class DirectLightAlongRays:
         position as a fraction of the segment, 0.5 without a kink.
         """
         at = [a, dr.lerp(a, b, TANGENT), dr.lerp(b, a, TANGENT), b]
-        first, second, third, last = (self._light.length(ray(t)) for t in at)
+        first, second, third, last = (self.light.length(ray(t)) for t in at)
         rise, fall = (second - first) * (1 / TANGENT), (last - third) * (1 / TANGENT)
         bend = rise - fall
         kink = (last - fall - first) / dr.select(bend != 0, bend, 1)

@@ -1,10 +1,10 @@
 """Error of derivatives by the extinction of media that are dense at an illuminated boundary.
 
-What the extinction removes on the way from a light is summed voxel by voxel, with the length of the
-way to the middle of the voxel. Where light of a sun or a point-like emitter enters through a dense
-face of the medium, the irradiance varies so much within the outermost voxels that this is
-inaccurate, in particular at grazing incidence. There, voxels are divided, and steps along camera
-rays are as short as their parts.
+Light that several events scatter into a camera ray is scattered in a voxel first. What the
+extinction removes on its way there is summed voxel by voxel. Where light of a sun or a point-like
+emitter enters through a dense face of the medium, the irradiance varies so much within the
+outermost voxels that the middle does not represent them, in particular at grazing incidence. There,
+several positions in each voxel do, and steps along camera rays are shorter.
 """
 
 from __future__ import annotations
@@ -19,27 +19,28 @@ from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.solvers.grid_size import border_depth
 
-#: Optical depth of an outermost voxel along the light above which voxels are divided, and the
-#: number of their parts along each axis; among surfaces and with several media they are not.
-DIVIDED, PARTS = 0.15, 2
+#: Optical depth of an outermost voxel along the light above which this applies; number of positions
+#: in each voxel, and of steps in place of one. Among surfaces and with several media it does not.
+DENSE, POSITIONS, SHORTER = 0.15, 4, 4
 #: Error of the derivative of an image by the logarithm of the extinction, in % of the radiance:
 #: factor d^order, with that depth d, at most DEEPEST, beyond which little light passes the voxel;
-#: without and with division of the voxels. Found with cubes of optical depth 3 and 10 and 12 to 48
-#: voxels, under suns of 1, 0.7 and 0.27 of normal incidence. A warning is logged above LARGE_ERROR.
-WHOLE_VOXELS, DIVIDED_VOXELS = (4.5, 1.5), (1.7, 1.3)
+#: for isolated media and for others. Found with cubes of optical depth 3 and 10 and 12 to 48
+#: voxels, under suns whose cosine of incidence is 0.15 to 1; for others with a small surface below
+#: these. A warning is logged above LARGE_ERROR.
+ISOLATED, AMONG_SURFACES = (0.65, 1.1), (1.8, 1.5)
 DEEPEST, LARGE_ERROR = 1.5, 0.5
 
 
 def is_dense_at_illuminated_border(part: CachedMedium) -> bool:
-    """Return whether `PARTS` of voxels along each axis are needed."""
-    return part.cache is not None and _largest_depth(part)[0] > DIVIDED
+    """Return whether `POSITIONS` in each voxel are needed."""
+    return part.cache is not None and _largest_depth(part)[0] > DENSE
 
 
-def warn_of_border_error(parts: Iterable[CachedMedium], divides: bool) -> bool:
+def warn_of_border_error(parts: Iterable[CachedMedium], isolated: bool) -> bool:
     """Log a warning if derivatives by the extinction of one of the media are inaccurate; return
-    whether it was logged. ``divides`` states that voxels are divided where it is needed.
+    whether it was logged. ``isolated`` states that there are no surfaces and no other media.
     """
-    factor, order = DIVIDED_VOXELS if divides else WHOLE_VOXELS
+    factor, order = ISOLATED if isolated else AMONG_SURFACES
     for part in parts:
         depth, light = _largest_depth(part)
         error = factor * min(depth, DEEPEST) ** order

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import product
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from mitsuba_irrcache.core.jit import opaque_point
+from mitsuba_irrcache.core.sequences import kronecker_words, unit_floats
 from mitsuba_irrcache.gradients.scattering import Components, IsotropicScattering, OrdinatePart
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import suns
@@ -79,22 +77,31 @@ class LightsOfOneDirection:
         """Return the transmittance of the medium between each voxel and an emitter."""
         return self._transmittance(light, self.positions)
 
-    def positions_within(self, light: int, parts: int) -> Iterator[tuple[mi.Point3f, mi.Spectrum]]:
-        """Yield one position in every voxel after the other, ``parts`` along each of its axes; and
-        the irradiance there over that in the middle of the voxel and the number of positions.
+    def positions_within(self, light: int, count: int) -> Iterator[tuple[mi.Point3f, mi.Spectrum]]:
+        """Yield ``count`` positions in every voxel, one after the other; and the irradiance there
+        over that in the middle of the voxel and over ``count``.
+
+        A single position is the middle; several are those of a low-discrepancy sequence.
         """
         # docs/primer, below eq. (8.9)
-        if parts == 1:
+        if count == 1:
             yield self.positions, mi.Spectrum(dr.opaque(mi.Float, 1, dr.width(self.positions)))
             return
         middle = self.transmittance(light)
-        per_middle = dr.select(middle > OPAQUE, dr.rcp(dr.maximum(middle, OPAQUE)), 0) / parts**3
-        edges = self._grid.to_world[:3, :3] / self._grid.resolution
-        for place in product((np.arange(parts) + 0.5) / parts - 0.5, repeat=3):
-            p = self.positions + mi.Vector3f(opaque_point(edges @ place))
+        per_middle = dr.select(middle > OPAQUE, dr.rcp(dr.maximum(middle, OPAQUE)), 0) / count
+        world, voxels = self._grid.world, dr.arange(mi.UInt32, self._grid.voxel_count)
+        for number in range(count):
+            index = voxels * dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, number)
+            place = unit_floats(kronecker_words(index, [mi.UInt32(0)] * 3))
+            p = self.positions + world.vector(mi.Vector3f(*place) - 0.5)
             share = self._transmittance(light, p) * per_middle
             dr.eval(p, share)
             yield p, share
+
+    def unattenuated(self, light: int, irradiance: mi.Spectrum) -> mi.Spectrum:
+        """Return an ``irradiance`` in the voxels without what the medium on the way removes."""
+        passed = self.transmittance(light)
+        return dr.select(passed > OPAQUE, irradiance / dr.maximum(passed, OPAQUE), 0)
 
     def _transmittance(self, light: int, p: mi.Point3f) -> mi.Spectrum:
         record = self._record(light, p)

@@ -8,7 +8,11 @@ import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import concatenated
-from mitsuba_irrcache.gradients.border_error import PARTS, is_dense_at_illuminated_border
+from mitsuba_irrcache.gradients.border_error import (
+    POSITIONS,
+    SHORTER,
+    is_dense_at_illuminated_border,
+)
 from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
 from mitsuba_irrcache.gradients.film import CameraPass, FilmAdjoint
 from mitsuba_irrcache.gradients.fluence import FluenceFields
@@ -104,10 +108,10 @@ class MediumAdjoint:
         self._scene, self._part, self._wanted = scene, part, wanted
         self._camera_rays, step = image
         self.medium, self._emitters = part.medium, emitters
-        #: number of positions in a voxel along each axis from which there are paths to lights
-        self.parts = 1
+        #: number of positions in each voxel from which there are paths to lights
+        self.positions, shorter = 1, 1
         if SIGMA_T in wanted and is_dense_at_illuminated_border(part):
-            self.parts, step = PARTS, step / PARTS
+            self.positions, shorter = POSITIONS, SHORTER
         #: emitters with respect to whose position or direction there are derivatives
         self.placements: list[Placement] = []
         self.transport: AdjointTransport | None = None
@@ -132,12 +136,13 @@ class MediumAdjoint:
         warn_of_aureole(part)
         neighbours = None
         if self.phases is not None:
+            phases = self.phases.below, self.phases.above
             marches = [
-                CameraReplay(self.medium, self.fluence.scattered_by(phase), colour, step)
-                for phase in (self.phases.below, self.phases.above)
+                CameraReplay(self.medium, fluence, colour, step, shorter=shorter)
+                for fluence in map(self.fluence.scattered_by, phases)
             ]
             neighbours = (*marches, self.phases.step)
-        self.march = CameraReplay(self.medium, self.fluence, colour, step, neighbours)
+        self.march = CameraReplay(self.medium, self.fluence, colour, step, neighbours, shorter)
 
     def _new_transport(self, seed: int, channels_apart: bool) -> AdjointTransport:
         settings, wanted = self._part.settings, self._wanted
@@ -200,6 +205,9 @@ class MediumAdjoint:
                 splats = self._camera_splats(dr.abs(ahead) + dr.abs(unscattered), film)
             self.march.replay(segments, ahead, unscattered, splats)
             dr.eval()
+            if splats.sigma_t is not None:
+                self.march.replay_light_paths(segments, each.sampler.next_1d(), splats)
+                dr.eval()
         found = self._at_data({role: getattr(splats, role).values() for role in self._sums})
         if splats.unscattered is not None:
             found[SIGMA_T] = found[SIGMA_T] + splats.unscattered.values()
@@ -345,29 +353,38 @@ class MediumAdjoint:
             result[MEAN_COSINE] = mi.Float(total * volume_of(self.grid))
         if SIGMA_T in self._sums:
             for light in range(len(transport.lights.emitters)):
-                result[SIGMA_T] = result[SIGMA_T] + self._along_paths_to_light(light, found)
+                own = self._along_paths_to_light(light, found, camera)
+                result[SIGMA_T] = result[SIGMA_T] + own
         return self._at_data(result) | placed
 
-    def _along_paths_to_light(self, light: int, found: Derivatives) -> mi.Float:
-        """Return derivatives through the extinction between an emitter and the voxels."""
+    def _along_paths_to_light(
+        self, light: int, found: Derivatives, camera: list[Components]
+    ) -> mi.Float:
+        """Return derivatives through the extinction between an emitter and the voxels.
+
+        ``camera`` is the adjoint fluence of camera rays. If the irradiance of the emitter is
+        evaluated along these, `replayed` returns their own derivatives.
+        """
         grid, lights = self.grid, self.transport.lights
         # A single channel that represents all holds the sum of their derivatives.
         several = dr.size_v(mi.Spectrum) // self.transport.channels
         share = dr.opaque(mi.Float, -volume_of(grid) / several)
-        removed = lights.irradiance[light] * lights.derivative(light, found.direct) * share
+        by_irradiance = lights.derivative(light, found.direct)
+        if self.march.evaluates(lights.emitters[light]):
+            own = self.transport.seen_directly(camera, self.extinction)
+            by_irradiance -= lights.derivative(light, own)
+        removed = lights.irradiance[light] * by_irradiance * share
         dr.eval(removed)
-        # Compute the positions twice: together they would take much memory.
-        largest = sum(
-            float(dr.max(dr.max(dr.abs(removed * own)))[0])
-            for _, own in lights.positions_within(light, self.parts)
-        )
+        # Elsewhere in the voxel the irradiance is at most that without the medium.
+        brightest = lights.unattenuated(light, removed) if self.positions > 1 else removed
+        largest = float(dr.max(dr.max(dr.abs(brightest)))[0])
         diagonal = float(np.linalg.norm(grid.side_lengths))
         bound = largest * grid.voxel_count * diagonal * 3
         splat, emitter = self._splat(SIGMA_T, bound * MARGIN), lights.emitters[light]
-        for p, own in lights.positions_within(light, self.parts):
+        for p, own in lights.positions_within(light, self.positions):
             change = removed * own
             dr.eval(change)
-            add_paths_to_light(self.medium, emitter, p, change, self.march.step, splat)
+            add_paths_to_light(self.medium, emitter, p, change, self.march.path_step, splat)
         return splat.values()
 
 

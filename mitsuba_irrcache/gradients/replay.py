@@ -15,12 +15,14 @@ from typing import NamedTuple, Protocol
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.angular_field import AngularField
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.core.fast_math import absorptance, minimum
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.gradients.points import add_paths_to_light
 from mitsuba_irrcache.gradients.splatting import (
     ConstantSplat,
     GridSplat,
@@ -34,6 +36,9 @@ from mitsuba_irrcache.media.medium import MediumGrid
 
 #: Transmittance below which the march of a ray ends.
 OPAQUE = 1e-6
+#: Number of lines to each light that the derivatives with respect to the extinction need for each
+#: voxel of the cache, about, and from each camera ray, at most. Noise of derivatives in voxels.
+PATHS_PER_VOXEL, MOST_PATHS_PER_RAY = 20, 8
 
 
 class RaySegments(NamedTuple):
@@ -169,6 +174,7 @@ class CameraReplay:
         step: the integrator's property.
         neighbours: marches with phase functions of slightly smaller and larger mean cosine, and the
             difference between these; None if no derivative with respect to it is wanted.
+        shorter: number of steps of camera rays in place of one.
     """
 
     def __init__(
@@ -178,27 +184,30 @@ class CameraReplay:
         colour: mi.Spectrum | None,
         step: float,
         neighbours: tuple[CameraReplay, CameraReplay, float] | None = None,
+        shorter: int = 1,
     ) -> None:
         self.medium, self.colour, self._neighbours = medium, colour, None
         if neighbours is not None:
             *marches, difference = neighbours
             self._neighbours = marches, dr.opaque(mi.Float, 1 / difference)
         self.irradiance = self._falloff = self._angular = None
-        self._direct_lights: list[DirectLightAlongRays] = []
+        self.direct_lights: list[DirectLightAlongRays] = []
         if fluence is not None:
             self.irradiance, self._falloff = fluence.irradiance, fluence.falloff
-            self._direct_lights, self._angular = fluence.direct_lights, fluence.angular
+            self.direct_lights, self._angular = fluence.direct_lights, fluence.angular
         irradiance = self.irradiance
         fields = medium.sigma_t, medium.albedo, irradiance
         edges = [f.grid.voxel_size.min() for f in fields if f is not None and f.grid is not None]
         length = min(edges, default=float(max(abs(medium.frame[:3, :3]).max(), 1e-30) / 64))
-        self.step = dr.opaque(mi.Float, float(length) * step)
+        self.step = dr.opaque(mi.Float, float(length) * step / shorter)
+        #: step along lines to lights
+        self.path_step = dr.opaque(mi.Float, float(length) * step)
 
     def without_scattering(self) -> CameraReplay:
         """Return a march with the same steps along which the medium scatters nothing."""
         march = copy(self)
         march.irradiance = march._falloff = march._angular = march._neighbours = None
-        march._direct_lights = []
+        march.direct_lights = []
         return march
 
     def indirect(self) -> CameraReplay:
@@ -239,7 +248,7 @@ class CameraReplay:
             phi = phi * self.colour
         if self._falloff is not None:
             phi = phi * self._falloff.at(p)
-        for light in self._direct_lights:
+        for light in self.direct_lights:
             phi = phi + light.at(p, active, direction, with_peak=True)
         return phi * dr.inv_four_pi
 
@@ -266,6 +275,84 @@ class CameraReplay:
             return values
         components = self._angular.importance(p, view, active)
         return [value * layer for value in values for layer in components]
+
+    def evaluates(self, emitter: mi.Emitter) -> bool:
+        """Return whether the irradiance of ``emitter`` is evaluated along rays."""
+        return any(light.light.emitter is emitter for light in self.direct_lights)
+
+    def replay_light_paths(
+        self, segments: RaySegments, random: mi.Float, splats: CameraSplats | CameraReaders
+    ) -> CameraSplats | CameraReaders:
+        """Add derivatives with respect to the extinction between the rays and the lights whose
+        irradiance is evaluated along them, and return ``splats``.
+
+        From some positions on each ray, there are lines to the lights. The positions are chosen in
+        proportion to the radiance of a light that is scattered into the ray there, stratified, with
+        uniform numbers ``random`` in [0, 1).
+        """
+        # docs/primer, below eq. (8.9)
+        for light in self.direct_lights:
+            paths = self._paths_per_ray(light, dr.width(segments.near))
+            total, _, _ = self._scattered_along(light, segments, [])
+            dr.eval(total)
+            targets = [total * ((random + n) * (1 / paths)) for n in range(paths)]
+            _, places, colours = self._scattered_along(light, segments, targets)
+            dr.eval(places, colours)
+            for place, colour in zip(places, colours, strict=True):
+                splats.sigma_t = add_paths_to_light(
+                    self.medium,
+                    light.light.emitter,
+                    segments.ray(place),
+                    -colour * total * (1 / paths),
+                    self.path_step,
+                    splats.sigma_t,
+                )
+                dr.eval(splats.sigma_t)
+        return splats
+
+    def _paths_per_ray(self, light: DirectLightAlongRays, rays: int) -> int:
+        """Return the number of lines to a light from each of so many ``rays``."""
+        voxels = light.light.extinction.grid.voxel_count
+        return int(np.clip(np.ceil(PATHS_PER_VOXEL * voxels / rays), 1, MOST_PATHS_PER_RAY))
+
+    @symbolic
+    def _scattered_along(
+        self, light: DirectLightAlongRays, segments: RaySegments, targets: list[mi.Float]
+    ):
+        """Return the radiance of ``light`` that is scattered into rays, times their ``adjoint``.
+
+        It is the sum of the magnitudes in all channels. For each of the ``targets`` the results
+        also include the distance along the ray up to which so much is scattered, to within a step,
+        and the colour there: the radiance that the step scatters, over its sum.
+        """
+        ray, near, far, adjoint, offset, active = segments
+        k, t, passed = mi.Float(0), mi.Float(near), mi.Spectrum(adjoint)
+        transmittance, active = mi.Spectrum(1), mi.Bool(active) & (near < far)
+        view, total = self.view(ray.d), mi.Float(0)
+        direction = view[0] if view else None
+        places = [mi.Float(near) for _ in targets]
+        colours = [mi.Spectrum(dr.zeros(mi.Float, dr.width(near))) for _ in targets]
+        while dr.hint(active, label="camera rays"):
+            end = minimum(dr.fma(k + offset, self.step, near), far)
+            middle = 0.5 * (t + end)
+            p = ray(middle)
+            absorbed = absorptance(self.sigma_t(p, active) * (end - t))
+            irradiance = light.at(p, active, direction, with_peak=True)
+            value = passed * absorbed * self.albedo(p, active) * irradiance * dr.inv_four_pi
+            weight = dr.sum(dr.abs(value))
+            following = total + weight
+            for number, target in enumerate(targets):
+                # The last step with radiance, if rounding errors leave a target beyond it.
+                chosen = active & (weight > 0) & (target >= total)
+                places[number] = dr.select(chosen, middle, places[number])
+                colours[number] = dr.select(chosen, value / weight, colours[number])
+            total = following
+            passed *= 1 - absorbed
+            transmittance *= 1 - absorbed
+            t = end
+            k += 1
+            active &= (t < far) & (dr.max(transmittance) > OPAQUE)
+        return total, places, colours
 
     @symbolic
     def radiance(self, segments: RaySegments):

@@ -60,18 +60,28 @@ class ImageTangent:
         tangents = VoxelTangents(g=self._g, lights=self._emitters.lights(transport.lights))
         if SIGMA_T in fields:
             tangents.sigma_t = list(sigma_t)
+            lights = transport.lights
+            removed = [
+                -irradiance * self._depth_to_light(light)
+                for light, irradiance in enumerate(lights.irradiance)
+            ]
+            # Where camera rays evaluate the irradiance of an emitter, `_of_rays` finds its change.
+            evaluated = [adjoint.march.evaluates(emitter) for emitter in lights.emitters]
+            if any(evaluated):
+                tangents.unseen = [
+                    own if seen else mi.Spectrum(0)
+                    for own, seen in zip(removed, evaluated, strict=True)
+                ]
             tangents.lights = [
-                change - irradiance * self._depth_to_light(light)
-                for light, (change, irradiance) in enumerate(
-                    zip(tangents.lights, transport.lights.irradiance, strict=True)
-                )
+                change if seen else change + own
+                for change, own, seen in zip(tangents.lights, removed, evaluated, strict=True)
             ]
         if fields.keys() & {SIGMA_T, ALBEDO}:
             tangents.collided = list(collided)
         if EMISSION in fields:
             tangents.emitted = list(emitted)
         tangents.incoming = self._emitters.incoming(transport)
-        dr.eval(tangents.lights)
+        dr.eval(tangents.lights, tangents.unseen)
         of = FluenceTangent(transport, adjoint.fluence.collided, adjoint.extinction, tangents)
         return ChangesOfVoxels(adjoint.grid, of.for_camera())
 
@@ -81,8 +91,8 @@ class ImageTangent:
         reader = FieldReader(
             mi.Spectrum(dr.zeros(mi.Float, adjoint.grid.voxel_count)), self._fields[SIGMA_T]
         )
-        emitter, step = lights.emitters[light], adjoint.march.step
-        for p, share in lights.positions_within(light, adjoint.parts):
+        emitter, step = lights.emitters[light], adjoint.march.path_step
+        for p, share in lights.positions_within(light, adjoint.positions):
             reader = add_paths_to_light(adjoint.medium, emitter, p, share, step, reader)
             dr.eval(reader.total)
         return reader.total
@@ -102,7 +112,8 @@ class ImageTangent:
         ahead, unscattered = ahead + transmittance * behind[0], original * behind[1]
         visible = (transmittance * weights[0] + original * weights[1]) * each.radiance
         dr.eval(ahead, unscattered, visible, transmittance, original)
-        radiance = self._replayed(segments, ahead, unscattered)
+        random = each.sampler.next_1d()
+        radiance = self._replayed(segments, ahead, unscattered, random)
         if self._emitters:
             radiance = radiance + visible * self._emitters.background(each.ray)
         alpha = mi.Float(0)
@@ -119,13 +130,21 @@ class ImageTangent:
         return radiance, alpha
 
     def _replayed(
-        self, segments: RaySegments, ahead: mi.Spectrum, unscattered: mi.Spectrum
+        self,
+        segments: RaySegments,
+        ahead: mi.Spectrum,
+        unscattered: mi.Spectrum,
+        random: mi.Float | None = None,
     ) -> mi.Spectrum:
-        """Return the sum of all changes along rays, see `CameraReplay.replay`."""
+        """Return the sum of all changes along rays, see `CameraReplay.replay`; with ``random``
+        numbers also those of `CameraReplay.replay_light_paths`.
+        """
         original = self._original if self._adjoint.is_scaled else None
         changes = MediumChanges(self._fields, self._g, self._collisions, original)
         readers = changes.readers(dr.width(segments.near))
         readers = self._adjoint.march.replay(segments, ahead, unscattered, readers)
+        if random is not None and readers.sigma_t is not None:
+            readers = self._adjoint.march.replay_light_paths(segments, random, readers)
         total = readers.total()
         dr.eval(total)
         return total

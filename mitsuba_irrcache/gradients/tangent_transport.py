@@ -32,6 +32,7 @@ class VoxelTangents:
         emitted: of the emission coefficient, by channel.
         g: of the mean cosine of the phase function.
         lights: of the irradiance of each emitter of one direction in the voxels.
+        unseen: likewise, for irradiance that camera rays do not read from the voxels.
         incoming: of the irradiance (n, 2, channels) that enters along the ordinates; None for none.
     """
 
@@ -40,20 +41,29 @@ class VoxelTangents:
     emitted: list[mi.Float] = field(default_factory=list)
     g: float = 0.0
     lights: list[mi.Spectrum] = field(default_factory=list)
+    unseen: list[mi.Spectrum] = field(default_factory=list)
     incoming: np.ndarray | None = None
 
 
-def propagated(transport: AdjointTransport, first: list[list[Components]]) -> list[Components]:
+def propagated(
+    transport: AdjointTransport,
+    first: list[list[Components]],
+    unseen: list[list[Components]] | None = None,
+) -> list[Components]:
     """Return what the importance of camera rays that collide in a voxel is multiplied by.
 
     ``first`` are, by channel, the components of the change of the fluence of collisions before
-    further scattering between voxels, for each part of the radiance. The results are those of
+    further scattering between voxels, for each part of the radiance; ``unseen`` are those of
+    changes that camera rays do not read from the voxels. The results are those of
     `FluenceTangent.for_camera`.
     """
     # docs/primer, eq. (8.18)
     found: list = [None] * transport.channels
     for level, own in transport.levels:
-        travelled = _scattered_on(transport, level, [first[c] for c in own])
+        scattered = [first[c] for c in own]
+        if unseen is not None:
+            scattered = [_sum_of_parts(first[c], unseen[c]) for c in own]
+        travelled = _scattered_on(transport, level, scattered)
         for c, components in zip(own, travelled, strict=True):
             found[c] = _weighted(transport, c, first[c], components)
     dr.eval(found)
@@ -122,7 +132,25 @@ class FluenceTangent:
         for level, own in transport.levels:
             for channel in own:
                 found[channel] = self._first(level, channel)
-        return propagated(transport, found)
+        unseen = None
+        if self._tangents.unseen:
+            unseen = [
+                self._of_lights(self._tangents.unseen, channel)
+                for channel in range(transport.channels)
+            ]
+        return propagated(transport, found, unseen)
+
+    def _of_lights(self, changes: list[mi.Spectrum], channel: int) -> list[Components]:
+        """Return the components of ``changes`` of the irradiance of emitters of one direction, for
+        each part of the radiance.
+        """
+        lights, scattering = self._transport.lights, self._transport.scattering
+        parts = [self._zeros() for _ in self._transport.parts]
+        for light, change in enumerate(changes):
+            own = scattering.from_direction(change[channel], lights.towards(light))
+            parts[lights.parts[light]] = _sum(parts[lights.parts[light]], own)
+        dr.eval(parts)
+        return parts
 
     def _first(self, level: MultigridLevel, channel: int) -> list[Components]:
         """Return the change before further scattering, for each part of the radiance.
@@ -142,10 +170,7 @@ class FluenceTangent:
                 if tangents.incoming is not None:
                     found = _sum(found, self._entering(level, part, channel))
             parts.append(found)
-        for light, change in enumerate(tangents.lights):
-            number, towards = transport.lights.parts[light], transport.lights.towards(light)
-            own = transport.scattering.from_direction(change[channel], towards)
-            parts[number] = _sum(parts[number], own)
+        parts = _sum_of_parts(parts, self._of_lights(tangents.lights, channel))
         dr.eval(parts)
         return parts
 
@@ -269,3 +294,7 @@ class FluenceTangent:
 
 def _sum(first: Components, second: Components) -> Components:
     return [a + b for a, b in zip(first, second, strict=True)]
+
+
+def _sum_of_parts(first: list[Components], second: list[Components]) -> list[Components]:
+    return [_sum(a, b) for a, b in zip(first, second, strict=True)]

@@ -263,10 +263,28 @@ class AdjointTransport:
                 if self.neighbours is not None:
                     change = scattering.product(phi[c], travelled[c], self.neighbours.moments)
                     by_g.append(extinction[c] * self.albedo[c] * change)
-                scale = extinction[c] * scale
-                direct.append([scattering.scattered(components, scale) for components in totals[c]])
+                direct.append(self._by_direct(c, totals[c], extinction[c]))
         dr.eval(sigma_t, collided, direct, by_g)
         return Derivatives(sigma_t, collided, direct, emitted, by_g)
+
+    def _by_direct(
+        self, channel: int, adjoint: list[Components], extinction: mi.Float
+    ) -> list[Components]:
+        """Return `Derivatives.direct` of a channel for an ``adjoint`` fluence of each part."""
+        scale = extinction * self.albedo[channel] * dr.inv_four_pi
+        return [self.scattering.scattered(components, scale) for components in adjoint]
+
+    def seen_directly(
+        self, camera: list[Components], extinction: list[mi.Float]
+    ) -> list[list[Components]]:
+        """Return the share of `Derivatives.direct` that ``camera`` rays have themselves, without
+        further scattering; arguments as those of `derivatives`.
+        """
+        none = self._zeros(self.scattering.count)
+        return [
+            self._by_direct(c, self.scattering.of_parts(components, none), extinction[c])
+            for c, components in enumerate(camera)
+        ]
 
     def _products(
         self,

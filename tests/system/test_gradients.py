@@ -401,8 +401,8 @@ def test_other_images_and_edits_that_are_undone_do_not_matter(rgb):
 
 
 def test_derivatives_where_a_sun_enters_a_dense_face_at_grazing_incidence(rgb, scenes):
-    """The irradiance varies by a factor of 1.6 within the outermost voxels: without their division
-    the derivative by the extinction is 1.1 % of the radiance too small.
+    """The irradiance varies by a factor of 1.6 within the outermost voxels: if it is summed in
+    their middles, the derivative by the extinction is 1.1 % of the radiance too small.
     """
     shape = scenes.boundary(scenes.medium(1.5, 0.9))
     sun = {"type": "directional", "direction": [0.4, -1.0, 0.3], "irradiance": 2.0}
@@ -423,7 +423,7 @@ def test_derivatives_where_a_sun_enters_a_dense_face_at_grazing_incidence(rgb, s
     params[key] = start * factor
     params.update()
     dr.backward(dr.mean(mi.render(scene, params, spp=64), axis=None))
-    assert abs(dr.grad(factor)[0] - difference) < 0.008 * radiance(1.0)
+    assert abs(dr.grad(factor)[0] - difference) < 0.003 * radiance(1.0)
 
 
 @pytest.mark.parametrize(
