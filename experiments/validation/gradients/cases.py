@@ -74,6 +74,8 @@ class Case:
     empty_beyond: float = 1.0
     changed: tuple[float, float] = (0.25, 0.75)
     turn: float = 0.0
+    #: whether the density is the same up to the boundary
+    even: bool = False
     shape: str = "cube"
     homogeneous: bool = False
     filter: str = "box"
@@ -97,7 +99,7 @@ class Case:
 
     def sigma_t(self) -> np.ndarray:
         """Extinction (z, y, x, channel)."""
-        values = matter(self.data)
+        values = np.ones((self.data,) * 3) if self.even else matter(self.data)
         values = np.where(values < self.empty_below, 0, values)
         values[:, :, round(self.empty_beyond * self.data) :] = 0
         peak = self.depth * self.data / EDGE
@@ -420,6 +422,7 @@ def _exact(case: Case) -> dict:
     }
 
 
+EVEN = {"even": True, "depth": 0.25, "changed": (0.05, 0.95), "parameters": ("sigma_t",)}
 COLOURED = {"albedo": (0.6, 0.75, 0.85), "emitters": _under(sky=SKY)}
 CASES = {
     "sky, single": Case(max_depth=2),
@@ -445,6 +448,9 @@ CASES = {
     "voxel depth 1.2": Case(depth=1.2),
     "voxel depth 2": Case(depth=2.0),
     "voxel depth 0.8, sun": Case(depth=0.8, emitters=_under(sun=SUN)),
+    "dense up to the boundary, sun": Case(**EVEN, emitters=_under(sun=SUN)),
+    "dense up to the boundary, sun, single": Case(**EVEN, emitters=_under(sun=SUN), max_depth=2),
+    "dense up to the boundary, point": Case(**EVEN, emitters=_under(point=POINT)),
     "edges of matter": Case(empty_below=0.05),
     "empty voxels": Case(empty_beyond=0.5, changed=(0.75, 0.85)),
     "empty voxels, single": Case(empty_beyond=0.5, changed=(0.75, 0.85), max_depth=2),
