@@ -57,6 +57,18 @@ def test_both_modes_agree(mono, name):
 
 
 @pytest.mark.parametrize(
+    ("name", "difference"),
+    [
+        ("dense up to the boundary, sun, single", 1e-4),
+        ("dense up to the boundary, sun", DIFFERENCE),
+    ],
+)
+def test_both_modes_agree_on_light_that_camera_rays_evaluate(mono, name, difference):
+    """Both use the same lines to the sun."""
+    check(CASES[name], difference)
+
+
+@pytest.mark.parametrize(
     "name",
     [
         "coloured extinction",
