@@ -12,7 +12,7 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.parameters import MEAN_COSINE, SIGMA_T
 from mitsuba_irrcache.media.bake import children
-from mitsuba_irrcache.media.phase import LARGEST_PEAK, MAX_ORDER, MAX_TAIL, MAX_TRUNCATED_ORDER
+from mitsuba_irrcache.media.phase import LARGEST_PEAK, MAX_ORDER, MAX_TAIL, TAIL_ORDER
 
 #: Optical depth of the scene's diagonal by which the extinction is scaled if the start is thinner.
 DEPTH = 4.0
@@ -27,8 +27,8 @@ BLACKEST = 1e-3
 SHARPEST = 0.99
 #: Mean cosines of ``hg`` that irrcache supports backwards and forwards. The margin is for the
 #: differences by g in its gradients.
-BACKWARDS = 0.01 - MAX_TAIL ** (1 / (MAX_ORDER + 1))
-FORWARDS = LARGEST_PEAK ** (1 / (MAX_TRUNCATED_ORDER + 1)) - 0.01
+BACKWARDS = 0.01 - MAX_TAIL ** (1 / (TAIL_ORDER + 1))
+FORWARDS = LARGEST_PEAK ** (1 / (MAX_ORDER + 1)) - 0.01
 #: Smallest |g| with irrcache, which has no gradient by g where a medium scatters isotropically.
 ISOTROPIC = 1e-4
 #: Scale of g, about the length of the first step of L-BFGS. Larger ones often end at a bound.

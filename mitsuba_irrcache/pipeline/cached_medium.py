@@ -35,6 +35,7 @@ from mitsuba_irrcache.lights.narrow_sources import MAX_LAMPS, sources_of
 from mitsuba_irrcache.machine.memory import release_unused_memory, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache
+from mitsuba_irrcache.pipeline.neglected_moments import error_of_neglected_moments
 from mitsuba_irrcache.scene.consistency import camera_rays
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.fine_shadows import warn_of_fine_shadows
@@ -68,6 +69,8 @@ LARGE_VARIANCE_AROUND_SENSOR = 0.06
 #: scenes with surfaces; with 1.6 to 2 % parts of images are off by up to 6 %, with 2.5 to 4 % means
 #: by 3 % and parts by 12 %.
 LARGE_DIRECTION_NOISE = 0.016
+#: Error of images due to neglected moments of the phase function, above which a warning is logged.
+LARGE_ERROR_OF_MOMENTS = 0.025
 #: Number of rays whose mean origin is the position of a sensor.
 SENSOR_RAYS = 16
 #: Lock of the thread that writes a cache file.
@@ -127,7 +130,7 @@ class CachedMedium:
         self._preview: IrradianceCache | None = None
         self._kept_solver: Solver | None = None
         self._direction_noise = 0.0
-        self._has_known_noise = False
+        self._has_known_noise = self._has_known_order = False
         self.cache: IrradianceCache | None = None
         #: closed form that replaces the cache; None if there is a cache, or no scattering
         self.half_space: HalfSpace | None = None
@@ -233,7 +236,26 @@ class CachedMedium:
             )
         if not self.is_dark and self.settings.warns:
             self._warn_of_noise(scene)
+            self._warn_of_neglected_moments(scene)
         return True
+
+    def _warn_of_neglected_moments(self, scene: mi.Scene) -> None:
+        """Log a warning, once for a cache, if the order of the moments of the radiance is too low
+        for what the sensors of the scene see.
+        """
+        phase = self.medium.phase
+        if self._has_known_order or phase.is_isotropic or not self.medium.is_isolated:
+            return
+        self._has_known_order = True
+        error = error_of_neglected_moments(scene, phase, self.settings.max_depth)
+        if error > LARGE_ERROR_OF_MOMENTS:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"irrcache: {self.label}the image has an error of about {100 * error:.0f} %, in "
+                f"parts of it three times as much: the cache represents its phase function by "
+                f"{phase.order} Legendre moments, and little of the light of the environment is "
+                'scattered towards the sensor. Use a broader phase function, or "volpath".',
+            )
 
     def _warn_of_noise(self, scene: mi.Scene) -> None:
         """Log a warning, once for a cache, if voxels that are sampled alone have too much noise.
@@ -291,7 +313,7 @@ class CachedMedium:
 
     def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
         """Load the cache from its file if it exists; otherwise create an empty one."""
-        self._has_known_noise = False
+        self._has_known_noise = self._has_known_order = False
         settings, medium, solver = self.settings, self.medium, self.solver
         grid, basis = self.grid, self._basis
         if settings.warns:

@@ -12,6 +12,8 @@ moment of degree l by the phase function's moment g_l (see `phase`; Lewis and Mi
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import groupby
+from operator import itemgetter
 
 import drjit as dr
 import mitsuba as mi
@@ -32,7 +34,12 @@ from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
     OrdinateSet,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup, TrackTable
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import SweptBox, Tracks, values_at_centres
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import (
+    SweptBox,
+    Tracks,
+    face_factor,
+    values_at_centres,
+)
 
 #: Highest degree of the moments that are corrected on coarser grids.
 COARSE_ORDER = 1
@@ -85,14 +92,23 @@ class Moments:
         table = tracks.table(directions, incoming, none, offsets, by_slice=True)
         table.boundary_source = boundary_source(table) if boundary_source is not None else None
         channels = (table if table.boundary_source is None else table.boundary_source).channels
-        sums = self.zeros(tracks.active_count * channels)
+        sums, layers = self.zeros(tracks.active_count * channels), tracks.layers
         ends = tracks.lower, tracks.lower + tracks.size
         place, channel = voxel_and_channel(tracks.active_count, channels)
         values = dr.gather(mi.UInt32, tracks.active, place), channel, channels
-        for axis, group, copies in tracks.sweep_separately(table, channels=channels):
+        swept = tracks.sweep_separately(table, channels=channels)
+        for axis, groups in groupby(swept, itemgetter(0)):
             box = SweptBox(tracks.grid, *ends, axis)
-            sums = _add_uncollided(self, sums, copies, group, box, values, tracks.layers)
-            dr.eval(sums)
+            own = self.zeros(tracks.active_count * channels) if layers else sums
+            for _, group, copies in groups:
+                own = _add_uncollided(self, own, copies, group, box, values, layers)
+                dr.eval(own)
+            if layers:
+                # A single ordinate may miss voxels, where no mean follows from its values.
+                factor = face_factor(own[0], tracks.grid, values, layers, [axis])
+                own = [a + factor * b for a, b in zip(sums, own, strict=True)]
+                dr.eval(own)
+            sums = own
         return concatenated(sums)
 
     def zeros(self, width: int) -> list[mi.Float]:
@@ -300,14 +316,15 @@ def _add_uncollided(
     """Add the moments of the irradiance that a sweep of a group has written to ``copies``.
 
     ``values`` are the voxel and the channel of each of the ``sums``, and the number of channels;
-    ``layers`` is that of `values_at_centres`.
+    ``layers`` is that of `values_at_centres`; means along the axis are not applied.
     """
     voxels, (voxel, channel, channels) = dr.opaque(mi.UInt32, box.grid.voxel_count), values
     k, begin = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(k < group.count, label="uncollided pairs"):
         where = copies, box, voxel, channel, channels
-        forward = values_at_centres(*where, begin=begin, layers=layers)
-        backward = values_at_centres(*where, begin=begin + voxels, layers=layers)
+        rest = {"layers": layers, "along_axis": False}
+        forward = values_at_centres(*where, begin=begin, **rest)
+        backward = values_at_centres(*where, begin=begin + voxels, **rest)
         basis = moments.basis(-group.direction(k))
         sums = _add_pair(moments, sums, basis, forward, backward)
         k += 1

@@ -25,7 +25,7 @@ in `extinction`, the record of a pair of ordinates in `track_layout`, and their 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import drjit as dr
@@ -335,6 +335,7 @@ def values_at_centres(
     begin: mi.UInt32 | int = 0,
     cut: mi.Bool | None = None,
     layers: int = 0,
+    along_axis: bool = True,
 ) -> mi.Float:
     """Return values at the centres of the voxels ``index`` of a box.
 
@@ -346,7 +347,7 @@ def values_at_centres(
     differences are omitted in voxels ``cut`` by surfaces, and next to them.
 
     In the outermost ``layers`` of voxels at each face of the grid, results are means over the voxel
-    along the normal of the face instead, where values are in the middle along the box's axis.
+    along the normal of the face instead, except for those across the axis unless ``along_axis``.
     """
     # docs/primer, eqs. (2.15), (4.5)
     grid, lower, upper, axis = box
@@ -359,7 +360,7 @@ def values_at_centres(
 
     value, change, factor = read(place), mi.Float(0), mi.Float(1)
     for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
-        if (k == axis and not layers) or upper[k] - lower[k] < 3:
+        if (k == axis and not (layers and along_axis)) or upper[k] - lower[k] < 3:
             continue
         stride, first, last = (dr.opaque(mi.UInt32, n) for n in (stride, lower[k], upper[k] - 1))
         # A voxel beside the box may lie on the border of the grid, with no neighbour beyond it.
@@ -392,26 +393,41 @@ def means_at_faces(values: mi.Spectrum, grid: Grid, voxels: mi.UInt32, layers: i
     """
     if not layers:
         return values
-    places, strides = grid.voxel_indices(voxels), strides_of(grid.resolution)
-    result = []
-    for value in values:
-        volume = dr.zeros(mi.Float, grid.voxel_count)
-        dr.scatter(volume, value, voxels)
-        factor = mi.Float(1)
-        for at, stride, count in zip(places, strides, grid.resolution, strict=True):
-            if count < 3:
-                continue
-            stride, last = (dr.opaque(mi.UInt32, int(n)) for n in (stride, count - 1))
-            centre = voxels + dr.select(at == 0, stride, 0) - dr.select(at == last, stride, 0)
-            around = centre - stride, centre, centre + stride
-            below, here, above = (dr.gather(mi.Float, volume, i) for i in around)
-            in_layers = (at < layers) | (at + layers > last)
-            in_layers &= (below > 0) & (here > 0) & (above > 0)
-            curvature = (below + above - 2 * here) / dr.select(in_layers, here, 1)
-            factor *= dr.select(in_layers, _mean_over_value(curvature), 1)
-        result.append(value * factor)
-    dr.eval(result)
-    return mi.Spectrum(*result)
+    found = [v * face_factor(v, grid, (voxels, 0, 1), layers, (0, 1, 2)) for v in values]
+    dr.eval(found)
+    return mi.Spectrum(*found)
+
+
+def face_factor(
+    values: mi.Float,
+    grid: Grid,
+    places: tuple[mi.UInt32, mi.UInt32 | int, int],
+    layers: int,
+    axes: Sequence[int],
+) -> mi.Float:
+    """Return means over values at the centres, as `means_at_faces` applies them, at the faces
+    across ``axes``.
+
+    ``places`` are the voxel and the channel of each of the ``values``, and the number of channels.
+    """
+    voxel, channel, channels = places
+    volume = dr.zeros(mi.Float, grid.voxel_count * channels)
+    dr.scatter(volume, values, voxel * channels + channel)
+    indices, strides = grid.voxel_indices(voxel), strides_of(grid.resolution)
+    factor = mi.Float(1)
+    for axis in axes:
+        at, count = indices[axis], int(grid.resolution[axis])
+        if count < 3:
+            continue
+        stride, last = (dr.opaque(mi.UInt32, int(n)) for n in (strides[axis], count - 1))
+        centre = voxel + dr.select(at == 0, stride, 0) - dr.select(at == last, stride, 0)
+        around = (i * channels + channel for i in (centre - stride, centre, centre + stride))
+        below, here, above = (dr.gather(mi.Float, volume, i) for i in around)
+        in_layers = (at < layers) | (at + layers > last)
+        in_layers &= (below > 0) & (here > 0) & (above > 0)
+        curvature = (below + above - 2 * here) / dr.select(in_layers, here, 1)
+        factor *= dr.select(in_layers, _mean_over_value(curvature), 1)
+    return factor
 
 
 def _mean_over_value(curvature: mi.Float) -> mi.Float:
