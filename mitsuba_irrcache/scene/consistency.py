@@ -153,7 +153,9 @@ def warn_of_far_plane(scene: mi.Scene, sensor: mi.Sensor) -> None:
     hidden = int(dr.count(is_hidden)[0])
     if hidden == 0:
         return
-    farthest = float(dr.max(dr.select(is_hidden, beyond.t, 0))[0])
+    # Rays begin at the near plane, and far_clip is a distance along the axis of the sensor.
+    depth = (sensor.world_transform().inverse() @ beyond.p).z
+    farthest = float(dr.max(dr.select(is_hidden, depth, 0))[0])
     is_inside = sensor.get_medium() is not None
     what = "the medium around it, and all behind it," if is_inside else "a medium"
     mi.Log(

@@ -173,6 +173,27 @@ def test_far_planes_of_sensors_in_a_medium(scenes, logged, has_ground, far, is_w
     assert any("far plane" in message for message in logged) == is_warned
 
 
+def test_the_warning_of_a_far_plane_names_one_that_suffices(scenes, logged):
+    """Also where rays begin at a near plane that is far away."""
+    sensor = {
+        "type": "perspective",
+        "fov": 20,
+        "near_clip": 2.5,
+        "far_clip": 3.0,
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 8, "height": 8},
+    }
+    settings = {"type": "irrcache", "solver": "sweep", "resolution": 8}
+    scene = scenes.description(settings, scenes.boundary(scenes.medium(1.0, 0.5)))
+    mi.render(mi.load_dict(scene | {"sensor": sensor}), spp=1)
+    (warning,) = (message for message in logged if "far plane" in message)
+    sensor["far_clip"] = 1.001 * float(warning.rsplit("more than ", 1)[1].rstrip("."))
+    assert sensor["far_clip"] == pytest.approx(4, rel=0.01)
+    logged.clear()
+    mi.render(mi.load_dict(scene | {"sensor": sensor}), spp=1)
+    assert not any("far plane" in message for message in logged)
+
+
 def test_radiance_and_irradiance_meters(scenes):
     """Radiance and irradiance meters agree with volpath.
 
