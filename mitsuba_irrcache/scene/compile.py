@@ -93,6 +93,7 @@ def compile_scene(
         check_placement(emitter)
         _warn_of_weight(emitter)
         _warn_of_normals(emitter)
+        _warn_of_directional_area(emitter)
         _check_radiance(emitter)
     _warn_of_lost_bounds(scene)
     for sensor in scene.sensors():
@@ -474,6 +475,17 @@ def _check_radiance(emitter: mi.Emitter) -> None:
             "which Mitsuba evaluates to 0 at positions that it samples on a mesh: with volpath, "
             "too, such an emitter hardly illuminates the scene. Use a bitmap as its radiance, or a "
             "mesh for each value."
+        )
+
+
+def _warn_of_directional_area(emitter: mi.Emitter) -> None:
+    """Log a warning for an emitter that only paths which start at emitters would find."""
+    if kind_of(emitter) is EmitterKind.DIRECTIONAL_AREA:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'irrcache: emitter "{emitter.id()}" ({emitter.class_name()}) illuminates nothing, as '
+            "with volpath: paths from the camera cannot reach it. Use an emitter of the type "
+            '"directional", "spot" or "area".',
         )
 
 

@@ -88,3 +88,11 @@ def test_directional_area_is_refused_where_it_would_be_left_out(scenes):
     scene = scenes.load(VOLPATH, scenes.boundary(scenes.medium(1.0, 0.8)), lamp=lamp)
     with pytest.raises(UnsupportedSceneError, match=r'"beamer".*directional area'):
         DistantIllumination(scene)
+
+
+def test_directional_area_emitters_are_warned_of(scenes, logged):
+    lamp = {"type": "rectangle", "emitter": {"type": "directionalarea", "id": "beamer"}}
+    settings = {"type": "irrcache", "solver": "auto", "resolution": 4, "cache_spp": 8}
+    scene = scenes.load(settings, scenes.boundary(scenes.medium(1.0, 0.8)), 4, lamp=lamp)
+    mi.render(scene, spp=1)
+    assert any('"beamer"' in text and "illuminates nothing" in text for text in logged)
