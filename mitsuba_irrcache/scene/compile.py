@@ -141,6 +141,11 @@ def _detail(scene: mi.Scene, emission: Emission | None, max_depth: int) -> Detai
     return detail_of(illuminating(scene))
 
 
+def _has_uneven_environment(scene: mi.Scene) -> bool:
+    environment = scene.environment()
+    return environment is not None and kind_of(environment) is EmitterKind.ENVIRONMENT_MAP
+
+
 def _holds_emitters(scene: mi.Scene, frame: np.ndarray) -> bool:
     """Return whether the bounding box of any emitting shape meets that of the cube [-1, 1]^3 mapped
     by ``frame``.
@@ -220,6 +225,8 @@ def _baked(
                 object_sizes=_object_sizes(scene, boundary.to_world),
             ),
         )
+        if is_isolated and not _has_uneven_environment(scene):
+            grid = grid.replaced(phase=grid.phase.in_even_light())
         grids.append(grid)
         if _is_visible(scene, medium):
             visible.add(grid.name)
