@@ -45,7 +45,7 @@ def is_smooth(environment: mi.Emitter) -> bool:
     texels = mi.traverse(environment).get("data")
     if texels is not None and not dr.all(dr.isfinite(texels.array)):
         return False
-    _, even = _even_radiance(environment)
+    _, even = even_radiance(environment)
     points = mi.Point2f(np.float32(lattice_points(SAMPLES, GOLDEN_STEP)))
     record, _ = environment.sample_direction(dr.zeros(mi.Interaction3f, SAMPLES), points)
     towards = np.array(record.d, dtype=np.float64)
@@ -65,7 +65,7 @@ def exceeds_even_ordinates(environment: mi.Emitter) -> bool:
     """
     if not is_smooth(environment):
         return True
-    directions, radiance = _even_radiance(environment)
+    directions, radiance = even_radiance(environment)
     powers = [p for p in product(range(EXACT_DEGREE + 1), repeat=3) if sum(p) <= EXACT_DEGREE]
     polynomials = np.stack([np.prod(directions**p, axis=1) for p in powers], axis=1)
     smooth, *_ = np.linalg.lstsq(polynomials, radiance, rcond=None)
@@ -73,9 +73,11 @@ def exceeds_even_ordinates(environment: mi.Emitter) -> bool:
     return bool((detail > MOST_DETAIL * radiance.mean(axis=0)).any())
 
 
-def _even_radiance(environment: mi.Emitter) -> tuple[np.ndarray, np.ndarray]:
-    """Return evenly distributed directions (n, 3) and the radiance (n, channels) along them."""
-    upper, _ = fibonacci_hemisphere(EVEN // 2)
+def even_radiance(environment: mi.Emitter, count: int = EVEN) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` evenly distributed directions (n, 3) and the radiance (n, channels) along
+    them.
+    """
+    upper, _ = fibonacci_hemisphere(count // 2)
     directions = np.concatenate([upper, -upper])
     return directions, environment_radiance(environment, directions)
 

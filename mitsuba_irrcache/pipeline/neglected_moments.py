@@ -11,12 +11,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.sequences import fibonacci_hemisphere
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, suns
-from mitsuba_irrcache.lights.environments import environment_radiance
+from mitsuba_irrcache.lights.environments import even_radiance
 from mitsuba_irrcache.lights.narrow_sources import spots_of
-from mitsuba_irrcache.media.phase import Phase
+from mitsuba_irrcache.media.phase import TAIL, Phase
 
 #: Number of directions of the environment, and of rays along each side of the film.
 DIRECTIONS, RAYS = 1 << 12, 5
@@ -29,8 +28,10 @@ def error_of_neglected_moments(scene: mi.Scene, phase: Phase, max_depth: int) ->
     """Return the root mean square error of images of all sensors over their mean radiance, about.
 
     It is that of the radiance that an isolated medium with this ``phase`` function scatters into
-    camera rays once, as if the medium were thin.
+    camera rays once, as if the medium were thin; 0 if all neglected moments are small.
     """
+    if not phase.forward and phase.tail(phase.order) <= TAIL:
+        return 0.0
     environment = scene.environment()
     if environment is None or kind_of(environment) is EmitterKind.CONSTANT_ENVIRONMENT:
         return 0.0
@@ -61,9 +62,8 @@ def _smooth_part(environment: mi.Emitter) -> tuple[np.ndarray, np.ndarray, list]
     """Return directions (n, 3) towards an environment without its bright spots, the irradiance that
     each of them represents, and direction and irradiance of each spot.
     """
-    upper, _ = fibonacci_hemisphere(DIRECTIONS // 2)
-    towards = np.concatenate([upper, -upper])
-    radiance = environment_radiance(environment, -towards)
+    directions, radiance = even_radiance(environment, DIRECTIONS)
+    towards = -directions
     values = _grey(mi.Spectrum(*(mi.Float(c) for c in radiance.T)))
     found, shares = spots_of(environment)
     spots = []

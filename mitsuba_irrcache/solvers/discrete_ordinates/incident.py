@@ -17,11 +17,12 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.direct_light import DirectLight
-from mitsuba_irrcache.core.sequences import fibonacci_hemisphere, kronecker_steps, lattice_points
+from mitsuba_irrcache.core.sequences import kronecker_steps, lattice_points
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.lights.emitters import EmitterKind, illuminating, kind_of
 from mitsuba_irrcache.lights.environments import (
     environment_radiance,
+    even_radiance,
     exceeds_even_ordinates,
     is_smooth,
 )
@@ -38,8 +39,8 @@ from mitsuba_irrcache.transport.tracking import medium_transmittance
 #: irradiance along an ordinate is multiplied for that, and the error of a moment, over the
 #: irradiance, above which a lower degree is matched.
 MATCHED_DEGREE, SMALLEST_FACTOR, INEXACT = 3, 0.25, 1e-4
-#: Number of directions by which moments are found: uniformly distributed ones, and sampled ones.
-EVEN, SAMPLES = 1 << 13, 1 << 14
+#: Number of directions that are sampled to find moments.
+SAMPLES = 1 << 14
 #: Step of the second coordinate of lattices of points.
 STEP = kronecker_steps(2)[0]
 #: Number of pairs of ordinates of a pass per set of tracks of a sun.
@@ -326,9 +327,8 @@ class DistantIllumination:
             if self._samples_per_pair:
                 towards, values = self._sampled_radiance()
             else:
-                upper, _ = fibonacci_hemisphere(EVEN // 2)
-                towards = np.concatenate([upper, -upper])
-                values = 4 * np.pi * environment_radiance(self._environment, -towards)
+                directions, radiance = even_radiance(self._environment)
+                towards, values = -directions, 4 * np.pi * radiance
             self._exact_moments = _monomials(towards).T @ values / len(towards)
         return self._exact_moments
 
