@@ -340,13 +340,12 @@ class CameraReplay:
             irradiance = light.at(p, active, direction, with_peak=True)
             value = passed * absorbed * self.albedo(p, active) * irradiance * dr.inv_four_pi
             weight = dr.sum(dr.abs(value))
-            following = total + weight
             for number, target in enumerate(targets):
                 # The last step with radiance, if rounding errors leave a target beyond it.
                 chosen = active & (weight > 0) & (target >= total)
                 places[number] = dr.select(chosen, middle, places[number])
                 colours[number] = dr.select(chosen, value / weight, colours[number])
-            total = following
+            total += weight
             passed *= 1 - absorbed
             transmittance *= 1 - absorbed
             t = end

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cache
 from itertools import product
 
 import drjit as dr
@@ -66,11 +67,32 @@ def exceeds_even_ordinates(environment: mi.Emitter) -> bool:
     if not is_smooth(environment):
         return True
     directions, radiance = even_radiance(environment)
-    powers = [p for p in product(range(EXACT_DEGREE + 1), repeat=3) if sum(p) <= EXACT_DEGREE]
-    polynomials = np.stack([np.prod(directions**p, axis=1) for p in powers], axis=1)
+    polynomials = monomials(directions, EXACT_DEGREE)
     smooth, *_ = np.linalg.lstsq(polynomials, radiance, rcond=None)
     detail = np.sqrt(np.square(radiance - polynomials @ smooth).mean(axis=0))
     return bool((detail > MOST_DETAIL * radiance.mean(axis=0)).any())
+
+
+def is_uneven(environment: mi.Emitter | None) -> bool:
+    """Return whether there is an environment whose radiance may vary with the direction."""
+    return environment is not None and kind_of(environment) is EmitterKind.ENVIRONMENT_MAP
+
+
+@cache
+def powers(degree: int) -> list[tuple[int, int, int]]:
+    """Return the powers of x, y and z in all monomials up to ``degree``, in the order of theirs."""
+    found = product(range(degree + 1), repeat=3)
+    return sorted((each for each in found if sum(each) <= degree), key=sum)
+
+
+def monomials(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Return the m monomials (..., m) of ``directions`` (..., 3) up to ``degree``, see `powers`."""
+    found = {(0, 0, 0): np.ones(directions.shape[:-1])}
+    for power in powers(degree)[1:]:
+        axis = np.flatnonzero(power)[0]
+        lower = tuple(n - (k == axis) for k, n in enumerate(power))
+        found[power] = found[lower] * directions[..., axis]
+    return np.stack([found[power] for power in powers(degree)], axis=-1)
 
 
 def even_radiance(environment: mi.Emitter, count: int = EVEN) -> tuple[np.ndarray, np.ndarray]:

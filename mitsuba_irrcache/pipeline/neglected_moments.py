@@ -12,13 +12,14 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.spectrum import luminance
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, suns
-from mitsuba_irrcache.lights.environments import even_radiance
+from mitsuba_irrcache.lights.emitters import suns
+from mitsuba_irrcache.lights.environments import even_radiance, is_uneven
 from mitsuba_irrcache.lights.narrow_sources import spots_of
 from mitsuba_irrcache.media.phase import TAIL, Phase
+from mitsuba_irrcache.scene.consistency import camera_rays
 
-#: Number of directions of the environment, and of rays along each side of the film.
-DIRECTIONS, RAYS = 1 << 12, 5
+#: Numbers of directions of the environment, and of camera rays.
+DIRECTIONS, RAYS = 1 << 12, 64
 #: Ratio of the error of an image with all orders of scattering to that of single scattering, about:
 #: 0.4 to 0.6 in cubes of optical depth 4 and an albedo of 0.8.
 OF_ALL_ORDERS = 0.5
@@ -33,7 +34,7 @@ def error_of_neglected_moments(scene: mi.Scene, phase: Phase, max_depth: int) ->
     if not phase.forward and phase.tail(phase.order) <= TAIL:
         return 0.0
     environment = scene.environment()
-    if environment is None or kind_of(environment) is EmitterKind.CONSTANT_ENVIRONMENT:
+    if not is_uneven(environment):
         return 0.0
     towards, irradiance, spots = _smooth_part(environment)
     for sun in suns(scene):
@@ -45,7 +46,8 @@ def error_of_neglected_moments(scene: mi.Scene, phase: Phase, max_depth: int) ->
     neglected = np.where(degrees > phase.order, factors, 0)
     largest = 0.0
     for sensor in scene.sensors():
-        rays = _view(sensor)
+        ray, _ = camera_rays(sensor, RAYS)
+        rays = np.array(ray.d, dtype=np.float64).T.reshape(-1, 3)
         cosines = rays @ towards.T
         total = np.polynomial.legendre.legval(cosines, factors) @ irradiance
         missing = np.polynomial.legendre.legval(cosines, neglected) @ irradiance
@@ -81,11 +83,3 @@ def _smooth_part(environment: mi.Emitter) -> tuple[np.ndarray, np.ndarray, list]
 def _grey(spectrum: mi.Spectrum) -> np.ndarray:
     """Return the luminance of a spectrum (n)."""
     return np.array(luminance(spectrum), dtype=np.float64).ravel()
-
-
-def _view(sensor: mi.Sensor) -> np.ndarray:
-    """Return the directions (n, 3) of rays through points that are spread over the film."""
-    place = (np.arange(RAYS) + 0.5) / RAYS
-    x, y = (v.ravel().astype(np.float32) for v in np.meshgrid(place, place))
-    ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(x, y), mi.Point2f(0.5, 0.5))
-    return np.array(ray.d, dtype=np.float64).T.reshape(-1, 3)

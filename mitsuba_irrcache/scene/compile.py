@@ -28,7 +28,7 @@ from mitsuba_irrcache.lights.emitters import (
     is_never_sampled,
     kind_of,
 )
-from mitsuba_irrcache.lights.environments import detail_of
+from mitsuba_irrcache.lights.environments import detail_of, is_uneven
 from mitsuba_irrcache.media.bake import bake, children
 from mitsuba_irrcache.media.delta_m import without_forward_peak
 from mitsuba_irrcache.media.emission import Emission, check_emission_is_within
@@ -141,11 +141,6 @@ def _detail(scene: mi.Scene, emission: Emission | None, max_depth: int) -> Detai
     return detail_of(illuminating(scene))
 
 
-def _has_uneven_environment(scene: mi.Scene) -> bool:
-    environment = scene.environment()
-    return environment is not None and kind_of(environment) is EmitterKind.ENVIRONMENT_MAP
-
-
 def _holds_emitters(scene: mi.Scene, frame: np.ndarray) -> bool:
     """Return whether the bounding box of any emitting shape meets that of the cube [-1, 1]^3 mapped
     by ``frame``.
@@ -225,7 +220,7 @@ def _baked(
                 object_sizes=_object_sizes(scene, boundary.to_world),
             ),
         )
-        if is_isolated and not _has_uneven_environment(scene):
+        if is_isolated and not is_uneven(scene.environment()):
             grid = grid.replaced(phase=grid.phase.in_even_light())
         grids.append(grid)
         if _is_visible(scene, medium):

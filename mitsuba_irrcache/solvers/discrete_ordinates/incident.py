@@ -9,8 +9,6 @@ integrate smooth functions well.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
-from itertools import product
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +23,9 @@ from mitsuba_irrcache.lights.environments import (
     even_radiance,
     exceeds_even_ordinates,
     is_smooth,
+    is_uneven,
+    monomials,
+    powers,
 )
 from mitsuba_irrcache.lights.narrow_sources import is_bright, spots_of
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -158,7 +159,7 @@ class DistantIllumination:
     def _is_sampled(self, only_bright: bool) -> bool:
         """Return whether directions are sampled from the environment."""
         environment = self._environment
-        if environment is None or kind_of(environment) is EmitterKind.CONSTANT_ENVIRONMENT:
+        if not is_uneven(environment):
             return False
         return not is_smooth(environment) if only_bright else exceeds_even_ordinates(environment)
 
@@ -300,15 +301,14 @@ class DistantIllumination:
         of light from behind the camera had a noise of 4 % with 64 directions, now 0.5 %.
         """
         # docs/primer, below eq. (4.2)
-        environment = self._environment
-        if environment is None or kind_of(environment) is EmitterKind.CONSTANT_ENVIRONMENT:
+        if not is_uneven(self._environment):
             return
         masks, polynomials = [], []
         for directions, *_ in sets:
             towards = np.stack([-directions, directions], axis=1)
             number = self._numbers_of_regions(directions) if self._samples_per_pair else 0
             masks.append(np.broadcast_to(number == 0, towards.shape[:2]))
-            polynomials.append(_monomials(towards)[masks[-1]])
+            polynomials.append(monomials(towards, MATCHED_DEGREE)[masks[-1]])
         irradiance = np.concatenate(
             [incoming[mask] for (*_, incoming), mask in zip(sets, masks, strict=True)]
         )
@@ -321,7 +321,7 @@ class DistantIllumination:
 
     def _moments(self) -> np.ndarray:
         """Return the integrals (m, channels) of the radiance of the environment outside of bright
-        regions, times the m `_monomials` of the direction that it comes from.
+        regions, times the m `monomials` of the direction that it comes from.
         """
         if self._exact_moments is None:
             if self._samples_per_pair:
@@ -329,7 +329,7 @@ class DistantIllumination:
             else:
                 directions, radiance = even_radiance(self._environment)
                 towards, values = -directions, 4 * np.pi * radiance
-            self._exact_moments = _monomials(towards).T @ values / len(towards)
+            self._exact_moments = monomials(towards, MATCHED_DEGREE).T @ values / len(towards)
         return self._exact_moments
 
     def _sampled_radiance(self) -> tuple[np.ndarray, np.ndarray]:
@@ -379,23 +379,6 @@ class DistantIllumination:
         return np.stack(found, axis=1)
 
 
-@cache
-def _powers() -> list[tuple[int, int, int]]:
-    """Return the powers of x, y and z in the monomials up to `MATCHED_DEGREE`, by degree."""
-    powers = product(range(MATCHED_DEGREE + 1), repeat=3)
-    return sorted((each for each in powers if sum(each) <= MATCHED_DEGREE), key=sum)
-
-
-def _monomials(directions: np.ndarray) -> np.ndarray:
-    """Return the m monomials (..., m) of ``directions`` (..., 3), by degree."""
-    found = {(0, 0, 0): np.ones(directions.shape[:-1])}
-    for power in _powers()[1:]:
-        axis = np.flatnonzero(power)[0]
-        lower = tuple(n - (k == axis) for k, n in enumerate(power))
-        found[power] = found[lower] * directions[..., axis]
-    return np.stack([found[power] for power in _powers()], axis=-1)
-
-
 def _matching_factors(
     polynomials: np.ndarray, irradiance: np.ndarray, exact: np.ndarray
 ) -> np.ndarray:
@@ -407,7 +390,7 @@ def _matching_factors(
     factors = np.ones_like(irradiance)
     for c, own in enumerate(irradiance.T):
         for degree in range(MATCHED_DEGREE, -1, -1):
-            used = [n for n, power in enumerate(_powers()) if sum(power) <= degree]
+            used = [n for n, power in enumerate(powers(MATCHED_DEGREE)) if sum(power) <= degree]
             basis = polynomials[:, used]
             weighted = basis * own[:, None]
             missing = exact[used, c] - weighted.sum(axis=0)
