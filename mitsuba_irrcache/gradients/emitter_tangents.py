@@ -38,9 +38,9 @@ class EmitterTangents:
     def __len__(self) -> int:
         return len(self._changes)
 
-    def background(self, ray: mi.Ray3f) -> mi.Spectrum:
-        """Return the change of the radiance of the environment that rays see."""
-        return mi.Spectrum(0) if self._environment is None else self._environment.along(-ray.d)
+    def background(self, direction: mi.Vector3f) -> mi.Spectrum:
+        """Return the change of the radiance of the environment in each ``direction`` of a ray."""
+        return mi.Spectrum(0) if self._environment is None else self._environment.along(-direction)
 
     def lights(self, lights: LightsOfOneDirection) -> list[mi.Spectrum]:
         """Return, for each emitter of ``lights``, the change of its irradiance in all voxels.

@@ -34,12 +34,12 @@ class EmitterAdjoint:
     def __len__(self) -> int:
         return len(self._wanted)
 
-    def add_background(self, ray: mi.Ray3f, adjoint: mi.Spectrum) -> None:
+    def add_background(self, direction: mi.Vector3f, adjoint: mi.Spectrum) -> None:
         """Accumulate the derivatives through the environment that camera rays see directly, where
-        ``adjoint`` is the derivative with respect to the radiance along each ray.
+        ``adjoint`` is the derivative with respect to its radiance in each ``direction`` of a ray.
         """
         if self._environment is not None:
-            self._add_environment(-ray.d, adjoint)
+            self._add_environment(-direction, adjoint)
 
     def add_transport(self, transport: AdjointTransport, found: Derivatives) -> None:
         """Accumulate the derivatives through the irradiance of voxels by emitters, where

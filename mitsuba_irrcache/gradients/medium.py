@@ -38,6 +38,7 @@ from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
+from mitsuba_irrcache.render.blurred_background import environment_along
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 
 #: Numbers of pairs of ordinates where the cache has its default number of directions: usually; for
@@ -196,11 +197,16 @@ class MediumAdjoint:
         for each in film.passes():
             segments, behind, weights = self.rays(each, film.medium)
             ahead, transmittance, original = self.marched(segments)
+            peaked, blurred = self.blurred(each, segments, weights[0], transmittance, original)
+            behind = behind[0] + blurred, behind[1] - blurred
             ahead, unscattered = ahead + transmittance * behind[0], original * behind[1]
             visible = (transmittance * weights[0] + original * weights[1]) * each.radiance
-            dr.eval(ahead, visible, unscattered)
+            visible -= sum((weight for _, weight in peaked), mi.Spectrum(0))
+            dr.eval(ahead, visible, unscattered, peaked)
             if self._scene.environment() is not None:
-                self._emitters.add_background(each.ray, visible)
+                self._emitters.add_background(each.ray.d, visible)
+                for direction, weight in peaked:
+                    self._emitters.add_background(direction, weight)
             if splats is None:
                 splats = self._camera_splats(dr.abs(ahead) + dr.abs(unscattered), film)
             self.march.replay(segments, ahead, unscattered, splats)
@@ -227,6 +233,33 @@ class MediumAdjoint:
                 transmittance, segments.ray, segments.near, segments.far, segments.active
             )
         return ahead, transmittance, original
+
+    def blurred(
+        self,
+        each: CameraPass,
+        segments: RaySegments,
+        share: mi.Float,
+        transmittance: mi.Spectrum,
+        original: mi.Spectrum,
+    ) -> tuple[list[tuple[mi.Vector3f, mi.Spectrum]], mi.Spectrum]:
+        """Sample directions of radiance that a forward peak scatters, see
+        `ClosedFormCameraRays.blur`. ``share`` is the weight of the transmittance of the scaled
+        medium, see `rays`.
+
+        Returns the directions, with weights that include those of the rays; and the weighted change
+        of the radiance behind the medium, over the difference of both transmittances.
+        """
+        rays, ray, scene = self._camera_rays, segments.ray, self._scene
+        change, found = mi.Spectrum(0), []
+        if not (self.is_scaled and rays.blurs(scene)):
+            return found, change
+        u, before = each.sampler.next_2d(), environment_along(scene, ray, ray.d)
+        transmittances, active = (transmittance, original), segments.active & (share != 0)
+        for direction, weight in rays.blur(ray, *transmittances, u=u, active=active):
+            weight = weight * each.radiance
+            change += weight * (environment_along(scene, ray, direction) - before)
+            found.append((direction, weight * (transmittance - original)))
+        return found, change
 
     @property
     def shows_environment(self) -> bool:

@@ -109,13 +109,18 @@ class ImageTangent:
         adjoint = self._adjoint
         segments, behind, weights = adjoint.rays(each, film.medium)
         ahead, transmittance, original = adjoint.marched(segments)
+        peaked, blurred = adjoint.blurred(each, segments, weights[0], transmittance, original)
+        behind = behind[0] + blurred, behind[1] - blurred
         ahead, unscattered = ahead + transmittance * behind[0], original * behind[1]
         visible = (transmittance * weights[0] + original * weights[1]) * each.radiance
-        dr.eval(ahead, unscattered, visible, transmittance, original)
+        visible -= sum((weight for _, weight in peaked), mi.Spectrum(0))
+        dr.eval(ahead, unscattered, visible, transmittance, original, peaked)
         random = each.sampler.next_1d()
         radiance = self._replayed(segments, ahead, unscattered, random)
         if self._emitters:
-            radiance = radiance + visible * self._emitters.background(each.ray)
+            radiance = radiance + visible * self._emitters.background(each.ray.d)
+            for direction, weight in peaked:
+                radiance += weight * self._emitters.background(direction)
         alpha = mi.Float(0)
         if film.has_alpha and not adjoint.shows_environment and SIGMA_T in self._fields:
             # Alpha is 1 - the mean transmittance.

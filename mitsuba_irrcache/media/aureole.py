@@ -86,9 +86,14 @@ def _differences(
     degrees = np.arange(PEAK_MOMENTS)
     depths = np.maximum(depths, 1e-6)[:, None]
     several = np.exp(-depths) * np.expm1(depths * moments) / depths
-    beyond = np.clip((degrees - FIRST_ATTENUATED) / (PEAK_MOMENTS - FIRST_ATTENUATED), 0, 1)
-    window = 0.5 * (1 + np.cos(np.pi * beyond))
-    coefficients = (2 * degrees + 1) * window * (several - moments)
+    coefficients = (2 * degrees + 1) * series_window() * (several - moments)
     blur = np.exp(-0.25 * degrees * (degrees + 1) * variances[:, None])
     polynomials = np.polynomial.legendre.legvander(np.cos(angles), PEAK_MOMENTS - 1)
     return (blur[:, None] * coefficients) @ polynomials.T
+
+
+def series_window() -> np.ndarray:
+    """Return the factors of the `PEAK_MOMENTS` moments that attenuate those of highest degree."""
+    degrees = np.arange(PEAK_MOMENTS)
+    beyond = np.clip((degrees - FIRST_ATTENUATED) / (PEAK_MOMENTS - FIRST_ATTENUATED), 0, 1)
+    return 0.5 * (1 + np.cos(np.pi * beyond))

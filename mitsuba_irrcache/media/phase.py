@@ -22,6 +22,7 @@ from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.aureole import PEAK_MOMENTS, Aureole
+from mitsuba_irrcache.media.peak_blur import PeakBlur
 
 #: Maximum order of the spherical harmonics in a cache; and the order beyond which moments g_l must
 #: be at most MAX_TAIL in magnitude, which for ``hg`` limits |g| to 0.58. Otherwise a forward peak
@@ -69,7 +70,13 @@ class Phase:
         self.all_moments = moments if all_moments is None else all_moments
         #: Correction of narrow sources for multiple scattering into the ``forward`` peak. It is not
         #: left to its first use, in a symbolic loop: evaluating arrays there can abort Dr.Jit.
-        self.aureole = self._aureole() if forward and plugin is not None else None
+        self.aureole: Aureole | None = None
+        #: blur of the radiance behind the medium by that peak
+        self.blur: PeakBlur | None = None
+        if forward and plugin is not None:
+            peak_moments = self._peak_moments()
+            self.aureole = Aureole(peak_moments, forward / (1 - forward))
+            self.blur = PeakBlur(peak_moments)
 
     def tail(self, order: int) -> float:
         """Return the largest magnitude of the moments beyond ``order``."""
@@ -112,10 +119,11 @@ class Phase:
         moments = np.where(known, (self.moments - share) / (1 - share), 0)
         return Phase(self.plugin, moments, self.peak / (1 - share), share, self.moments)
 
-    def _aureole(self) -> Aureole:
+    def _peak_moments(self) -> np.ndarray:
+        """Return the Legendre moments of the ``forward`` peak."""
         moments = legendre_moments(self.plugin, PEAK_MOMENTS)[0] / self.forward
         moments[: self.order + 1] = 1
-        return Aureole(moments, self.forward / (1 - self.forward))
+        return moments
 
     def gain(
         self, p: mi.Point3f, direction: mi.Vector3f, towards: mi.Vector3f, active: mi.Bool = True

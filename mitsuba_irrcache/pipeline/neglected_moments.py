@@ -15,6 +15,7 @@ from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.lights.emitters import suns
 from mitsuba_irrcache.lights.environments import even_radiance, is_uneven
 from mitsuba_irrcache.lights.narrow_sources import spots_of
+from mitsuba_irrcache.media.peak_blur import BLUR_RADIUS
 from mitsuba_irrcache.media.phase import TAIL, Phase
 from mitsuba_irrcache.scene.consistency import camera_rays
 
@@ -43,14 +44,20 @@ def error_of_neglected_moments(scene: mi.Scene, phase: Phase, max_depth: int) ->
     degrees = np.arange(len(phase.all_moments))
     # The truncated peak is part of the rays behind the medium.
     factors = (2 * degrees + 1) * (phase.all_moments - phase.forward) / (1 - phase.forward)
-    neglected = np.where(degrees > phase.order, factors, 0)
+    neglected, largest_cosine = np.where(degrees > phase.order, factors, 0), 1.0
+    if phase.forward:
+        # Camera rays evaluate the environment within the angle of the blur, see `media/peak_blur`.
+        peak = np.where(degrees > phase.order, phase.all_moments, phase.forward)
+        neglected = (2 * degrees + 1) * peak / (1 - phase.forward)
+        largest_cosine = np.cos(BLUR_RADIUS)
     largest = 0.0
     for sensor in scene.sensors():
         ray, _ = camera_rays(sensor, RAYS)
         rays = np.array(ray.d, dtype=np.float64).T.reshape(-1, 3)
         cosines = rays @ towards.T
         total = np.polynomial.legendre.legval(cosines, factors) @ irradiance
-        missing = np.polynomial.legendre.legval(cosines, neglected) @ irradiance
+        missing = np.polynomial.legendre.legval(cosines, neglected)
+        missing = np.where(cosines <= largest_cosine, missing, 0) @ irradiance
         for direction, own in spots:
             value = np.polynomial.legendre.legval(rays @ direction, factors)
             total += np.maximum(value, 0) * own

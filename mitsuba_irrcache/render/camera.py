@@ -25,9 +25,17 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import random_stream
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.lights.environments import is_uneven
 from mitsuba_irrcache.machine.memory import release_unused_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
+from mitsuba_irrcache.render.blurred_background import (
+    SurroundingsChange,
+    blurred_directions,
+    environment_along,
+    peak_depth,
+    surroundings_change,
+)
 from mitsuba_irrcache.render.film import CameraSampler, scattered_rays, view_extent
 from mitsuba_irrcache.render.raymarch import CachedFields, Projection
 from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
@@ -179,6 +187,13 @@ class ClosedFormCameraRays:
         background = mi.Spectrum(0)
         if self.shows_emitters:
             background = (through * transmittance + straight * unscattered) * radiance + emitted
+        if self.blurs(scene):
+            u, ends_behind = sampler.next_2d(active), hit & (through != 0)
+            found = self.blur(ray, transmittance, unscattered, u=u, active=ends_behind)
+            peaked = transmittance - unscattered
+            for direction, weight in found:
+                other = environment_along(scene, ray, direction)
+                background += weight * peaked * (other - radiance)
         alpha = mi.Float(1)
         if not visible:  # dr.mean would make the number of samples a constant of the kernel
             alpha = 1 - dr.sum(unscattered) / dr.size_v(mi.Spectrum)
@@ -215,6 +230,26 @@ class ClosedFormCameraRays:
             through, straight = dr.select(ends, 0, through), dr.select(ends, 0, straight)
         return visible, environment.eval(escaped, active), through, straight
 
+    def blurs(self, scene: mi.Scene) -> bool:
+        """Return whether radiance behind the medium that a forward peak scatters is blurred."""
+        peaked = self.projection.truncates_peak and self.shows_emitters
+        return peaked and is_uneven(scene.environment())
+
+    def blur(
+        self,
+        ray: mi.Ray3f,
+        transmittance: mi.Spectrum,
+        unscattered: mi.Spectrum,
+        u: mi.Point2f,
+        active: mi.Bool,
+    ) -> list[tuple[mi.Vector3f, mi.Float]]:
+        """Return the `blurred_directions` of the environment for ``ray``, given both transmittances
+        of the medium and two random numbers ``u``.
+        """
+        depth = peak_depth(transmittance, unscattered)
+        found = blurred_directions(self.projection.directional.directional, ray.d, depth, u)
+        return [(direction, dr.select(active, weight, 0)) for direction, weight in found]
+
     def span(self, ray: mi.Ray3f, medium: mi.Medium | None) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Return whether ``ray``, which starts in ``medium``, intersects the medium with a cache,
         and the distances of entry and exit.
@@ -242,6 +277,10 @@ class _StraightRay:
     transmittance: mi.Spectrum
     #: transmittance for narrow sources, by the extinction before delta-M scaling
     unscattered: mi.Spectrum
+    #: the difference of both transmittances, and the distance of the middle of the medium where it
+    #: arises
+    peaked: mi.Spectrum
+    middle: mi.Float
     #: sums for `Layers`
     gathered: list
     #: the ray behind the last surface, and the medium there
@@ -351,6 +390,21 @@ class TracedCameraRays:
         chance = dr.minimum(dr.max(transmittance) * (1 / least), 1)
         traced = marched.stopped & (rng.next_float32(marched.stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
+        travelled, is_deflected = marched.near, mi.Bool(False)
+        if self.narrow is not None and scene.environment() is not None:
+            change = self._surroundings_change(scene, ray, marched, rng, active)
+            background += marched.peaked * change.environment
+            weight += dr.select(traced, marched.peaked * change.surface / chance, 0)
+            # Rays that leave the scene have no path yet: follow the one towards a surface.
+            towards = marched.peaked * change.weight
+            probability = dr.minimum(dr.max(dr.abs(towards)) * (1 / least), 1)
+            is_deflected = marched.escaped & (rng.next_float32(active) < probability)
+            weight = dr.select(is_deflected, towards / probability, weight)
+            traced |= is_deflected
+            inside = mi.Ray3f(ray(marched.middle), change.direction, ray.time, ray.wavelengths)
+            end = dr.select(is_deflected, inside, end)
+            pointer = dr.select(is_deflected, dr.zeros(mi.MediumPtr), pointer)
+            travelled = dr.select(is_deflected, marched.middle, travelled)
         is_stratified = isinstance(sampler, CameraSampler)
         if self.caches_surfaces:
             if is_stratified:
@@ -358,7 +412,7 @@ class TracedCameraRays:
             else:
                 on_emitter = EmitterSample(sampler.next_2d(traced))
             direct, reflected, straight, *_ = self._surfaces.paths.follow(
-                scene, end, pointer, rng, traced, on_emitter, self.hide_emitters, marched.near
+                scene, end, pointer, rng, traced, on_emitter, self.hide_emitters, travelled
             )
         else:
             sample = sampler.emitter_sample().u if is_stratified else None
@@ -375,6 +429,8 @@ class TracedCameraRays:
         if self.narrow is not None:
             lamp = self.narrow.hits_source(ray.o, ray.d, far=mi.Bool(False), near=traced)
             direct_weight = dr.select(lamp, unscattered / chance, weight)
+            lamp = self.narrow.hits_source(end.o, end.d, far=mi.Bool(False), near=is_deflected)
+            direct_weight = dr.select(lamp, 0, direct_weight)
         background += dr.select(traced, direct_weight * direct + weight * reflected, 0)
         alpha = mi.Float(1)
         if self.hide_emitters or scene.environment() is None:
@@ -385,6 +441,21 @@ class TracedCameraRays:
             transparency = dr.select(marched.escaped, transmittance, transparency)
             alpha = 1 - dr.sum(transparency) / dr.size_v(mi.Spectrum)
         return RayResult(marched.scattered, background, transmittance, alpha, marched.gathered)
+
+    def _surroundings_change(
+        self,
+        scene: mi.Scene,
+        ray: mi.Ray3f,
+        marched: _StraightRay,
+        rng: mi.PCG32,
+        active: mi.Bool,
+    ) -> SurroundingsChange:
+        """Estimate by how much the blur by forward peaks changes what is behind the media."""
+        middle = mi.Ray3f(ray(marched.middle), ray.d, ray.time, ray.wavelengths)
+        depth = peak_depth(marched.unscattered + marched.peaked, marched.unscattered)
+        active = active & (dr.max(marched.peaked) > 0)
+        lights = self.narrow
+        return surroundings_change(scene, lights, middle, marched.escaped, depth, rng, active)
 
     @symbolic
     def _march_to_surface(
@@ -401,6 +472,8 @@ class TracedCameraRays:
             background=mi.Spectrum(0),
             transmittance=mi.Spectrum(1),
             unscattered=mi.Spectrum(1),
+            peaked=mi.Spectrum(0),
+            middle=mi.Float(0),
             gathered=self.projection.zero_sums(),
             segment=mi.Ray3f(ray),
             pointer=mi.MediumPtr(pointer),
@@ -420,6 +493,7 @@ class TracedCameraRays:
             ends = is_first & ~valid & (state.pointer != None)  # noqa: E711
             far = dr.select(ends, ray.maxt, far)
             self._march_media(state, ray, far, offset)
+            state.peaked = dr.select(ends, 0, state.peaked)
             null = valid & is_null(si.bsdf().flags())
             crosses = self._add_emitter(scene, state, ray, si, null, ends)
             state.stopped |= valid & ~crosses
@@ -452,9 +526,12 @@ class TracedCameraRays:
             state.gathered = _added(state.gathered, sums, state.transmittance, scale)
             state.transmittance *= transmittance
             if self.narrow is not None:
+                crosses = hit & (entry < leave)
                 state.unscattered *= projection.unscattered(
-                    transmittance, ray, entry, leave, hit & (entry < leave)
+                    transmittance, ray, entry, leave, crosses
                 )
+                state.peaked = state.transmittance - state.unscattered
+                state.middle = dr.select(crosses, 0.5 * (entry + leave), state.middle)
 
     def _add_emitter(
         self,

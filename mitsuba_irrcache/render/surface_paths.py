@@ -31,7 +31,6 @@ from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitt
 from mitsuba_irrcache.render.surface_vertices import (
     facing,
     lambertian,
-    unobstructed,
     vertex_at,
 )
 from mitsuba_irrcache.transport.path import (
@@ -45,6 +44,7 @@ from mitsuba_irrcache.transport.path import (
     power_heuristic,
     sample_bsdf,
     straight_through,
+    unobstructed,
     visibility,
 )
 

@@ -1,33 +1,12 @@
-"""Surfaces that rays hit: whether any is not null, their normals, whether they are diffuse."""
+"""Surfaces that rays hit: their normals, whether they are diffuse."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
-
 #: Largest relative difference of f in three directions for which a BSDF counts as Lambertian.
 LAMBERTIAN = 1e-4
-
-
-@symbolic
-def unobstructed(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
-    """Return whether no surface but null ones lies on ``ray`` up to its end."""
-    ray, clear, active = mi.Ray3f(ray), mi.Bool(active), mi.Bool(active)
-    crossings = mi.UInt32(0)
-    while dr.hint(active, label="visible nodes"):
-        si = scene.ray_intersect(ray, active)
-        hit = active & si.is_valid()
-        null = is_null(si.bsdf().flags())
-        clear &= ~(hit & ~null)
-        remaining = ray.maxt - si.t
-        ray = si.spawn_ray(ray.d)
-        ray.maxt = remaining
-        crossings += 1
-        active &= hit & null & (crossings < MOST_CROSSINGS)
-    return clear
 
 
 def vertex_at(si: mi.SurfaceInteraction3f) -> mi.Interaction3f:

@@ -221,6 +221,24 @@ def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
 
 
 @symbolic
+def unobstructed(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
+    """Return whether no surface but null ones lies on ``ray`` up to its end."""
+    ray, clear, active = mi.Ray3f(ray), mi.Bool(active), mi.Bool(active)
+    crossings = mi.UInt32(0)
+    while dr.hint(active, label="unobstructed"):
+        si = scene.ray_intersect(ray, active)
+        hit = active & si.is_valid()
+        null = is_null(si.bsdf().flags())
+        clear &= ~(hit & ~null)
+        remaining = ray.maxt - si.t
+        ray = si.spawn_ray(ray.d)
+        ray.maxt = remaining
+        crossings += 1
+        active &= hit & null & (crossings < MOST_CROSSINGS)
+    return clear
+
+
+@symbolic
 def visibility(
     scene: mi.Scene,
     media: Media | PartlyOriginalMedia,

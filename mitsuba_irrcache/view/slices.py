@@ -133,6 +133,14 @@ class SlicedCameraRays(ClosedFormCameraRays):
         radiance, through = dr.select(ends, 1, radiance), dr.select(ends, 1, through)
         return visible, radiance, through, dr.select(ends, 0, straight)
 
+    def blur(
+        self, ray: mi.Ray3f, *transmittances: mi.Spectrum, u: mi.Point2f, active: mi.Bool
+    ) -> list[tuple[mi.Vector3f, mi.Float]]:
+        """Return the directions as `ClosedFormCameraRays.blur`, without weight for rays that end
+        at slices.
+        """
+        return super().blur(ray, *transmittances, u=u, active=active & (self._end == dr.inf))
+
     def span(self, ray: mi.Ray3f, medium: mi.Medium | None) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Return whether rays intersect the medium before they end, and where."""
         hit, near, far = super().span(ray, medium)

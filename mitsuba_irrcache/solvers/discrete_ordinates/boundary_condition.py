@@ -27,7 +27,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
-from mitsuba_irrcache.core.sequences import hashed_seed, random_stream
+from mitsuba_irrcache.core.sequences import hashed_seed, kronecker_points, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.medium_probe import probe
@@ -41,7 +41,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.cut_voxel_light import CutVoxel
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
-from mitsuba_irrcache.transport.path import Media, trace_to_infinity
+from mitsuba_irrcache.transport.path import Media, trace_to_infinity, unobstructed
 from mitsuba_irrcache.transport.path_tracer import PathStart, PathTracer
 
 #: Approximate maximum number of cells of an ordinate, for paths (one per cell), and for ordinates
@@ -54,6 +54,8 @@ PATH_CELLS, EMITTER_CELLS, SEPARATED_CELLS = 1 << 11, 1 << 16, 1 << 15
 INSET = 1e-3
 #: Offset of the random streams of paths from surfaces among the voxels.
 CROSSING_STREAM = 0x5F00
+#: Number of positions in the medium from which the visibility of the environment is tested.
+VISIBILITY_POINTS = 32
 #: Smallest number of rows of the table of ordinates, a power of two.
 FEWEST_ROWS = 1024
 #: Parameters of an ordinate that the kernel reads, see `IncomingRadiance._parameters`.
@@ -117,6 +119,22 @@ class SurfaceBoundary:
         for own in self._solved:
             found |= pointer == own
         return found
+
+    def visible_share(self, tracks: Tracks, towards: np.ndarray) -> np.ndarray:
+        """Return, for each of the directions ``towards`` (n, 3) the environment, the share (n) of
+        the box of ``tracks`` from which no surface occludes it.
+        """
+        places = tracks.lower + tracks.size * kronecker_points(np.arange(VISIBILITY_POINTS), 3).T
+        p = tracks.grid.world.point(mi.Point3f(np.float32(places.T)))
+        p = mi.Point3f(p + dr.zeros(mi.Float, VISIBILITY_POINTS))
+        way, place = Divisor(VISIBILITY_POINTS).split(
+            dr.arange(mi.UInt32, len(towards) * VISIBILITY_POINTS)
+        )
+        direction = dr.gather(mi.Vector3f, mi.Vector3f(np.float32(towards.T)), way)
+        ray = mi.Ray3f(dr.gather(mi.Point3f, p, place), direction)
+        clear = unobstructed(self.scene, ray, mi.Bool(True))
+        count = dr.block_sum(dr.select(clear, mi.Float(1), 0), VISIBILITY_POINTS)
+        return np.array(count, dtype=np.float64) / VISIBILITY_POINTS
 
     def crossings(self, tracks: Tracks, ordinates: Ordinates) -> SurfaceCrossings | None:
         """Return the crossings of tracks along ``ordinates`` with surfaces among the voxels."""

@@ -8,7 +8,7 @@ integrate smooth functions well.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -38,8 +38,11 @@ from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 #: Maximum degree of the moments of environments that are matched, the smallest factor by which the
 #: irradiance along an ordinate is multiplied for that, and the error of a moment, over the
-#: irradiance, above which a lower degree is matched.
+#: irradiance, above which the degree is lower.
 MATCHED_DEGREE, SMALLEST_FACTOR, INEXACT = 3, 0.25, 1e-4
+#: Share of the irradiance of an environment that surfaces must not occlude for its moments to be
+#: matched.
+LEAST_VISIBLE = 0.2
 #: Number of directions that are sampled to find moments.
 SAMPLES = 1 << 14
 #: Step of the second coordinate of lattices of points.
@@ -123,16 +126,25 @@ class DistantIllumination:
             return [each._replace(incoming=grey) for each, grey in factored], colour
         return sets, np.ones(channels)
 
-    def ordinates(self, passes: int, pairs: int, rng: np.random.Generator) -> list[Ordinates]:
+    def ordinates(
+        self,
+        passes: int,
+        pairs: int,
+        rng: np.random.Generator,
+        visible_share: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> list[Ordinates]:
         """Return the ordinates of each pass: an even set, along which voxels emit and scatter, too,
         followed by the ordinates that only emitters use.
+
+        ``visible_share`` returns, for each direction (n, 3) towards the environment, the share of
+        the medium from which the environment is visible there; None: all of it.
         """
         even = joint_ordinates(passes, pairs, rng)
         if self._samples_per_pair:
             found = self._with_samples(even, max(1, int(pairs * self._samples_per_pair)), rng)
         else:
             found = [(*own, self._even_irradiance(*own)) for own in even]
-        self._match_moments(found)
+        self._match_moments(found, visible_share)
         return [self._with_suns(pairs, *own, rng) for own in found]
 
     @property
@@ -292,36 +304,43 @@ class DistantIllumination:
             for (*_, incoming), number in zip(sets, numbers, strict=True):
                 incoming[number == k] *= factor
 
-    def _match_moments(self, sets: list[tuple]) -> None:
+    def _match_moments(self, sets: list[tuple], visible_share: Callable | None) -> None:
         """Scale the irradiance along the ordinates outside of bright regions such that all of them
-        together have the moments of the environment there.
+        together have the moments of the environment there, as far as it is visible.
 
         Few ordinates miss parts of an uneven environment. That matters most where little of it is
         scattered towards the camera: with g = 0.5 and a sky that is black below, single scattering
         of light from behind the camera had a noise of 4 % with 64 directions, now 0.5 %.
         """
         # docs/primer, below eq. (4.2)
-        if not is_uneven(self._environment):
+        if self._environment is None:
             return
-        masks, polynomials = [], []
+        exact = self._moments(visible_share)
+        if exact is None:
+            return
+        masks, towards = [], []
         for directions, *_ in sets:
-            towards = np.stack([-directions, directions], axis=1)
+            both = np.stack([-directions, directions], axis=1)
             number = self._numbers_of_regions(directions) if self._samples_per_pair else 0
-            masks.append(np.broadcast_to(number == 0, towards.shape[:2]))
-            polynomials.append(monomials(towards, MATCHED_DEGREE)[masks[-1]])
+            masks.append(np.broadcast_to(number == 0, both.shape[:2]))
+            towards.append(both[masks[-1]])
+        towards = np.concatenate(towards)
         irradiance = np.concatenate(
             [incoming[mask] for (*_, incoming), mask in zip(sets, masks, strict=True)]
         )
-        factors = _matching_factors(
-            np.concatenate(polynomials), irradiance / len(sets), self._moments()
-        )
+        irradiance = irradiance / len(sets)
+        if visible_share is not None:
+            irradiance = irradiance * visible_share(towards)[:, None]
+        factors = _matching_factors(monomials(towards, MATCHED_DEGREE), irradiance, exact)
         for (*_, incoming), mask in zip(sets, masks, strict=True):
             own, factors = np.split(factors, [mask.sum()])
             incoming[mask] *= own
 
-    def _moments(self) -> np.ndarray:
+    def _moments(self, visible_share: Callable | None) -> np.ndarray | None:
         """Return the integrals (m, channels) of the radiance of the environment outside of bright
-        regions, times the m `monomials` of the direction that it comes from.
+        regions, as far as it is visible, times the m `monomials` of the direction that it comes
+        from; None if ordinates are not to be scaled: they integrate uniform radiance exactly, and
+        what is visible through small openings differs from place to place.
         """
         if self._exact_moments is None:
             if self._samples_per_pair:
@@ -329,8 +348,17 @@ class DistantIllumination:
             else:
                 directions, radiance = even_radiance(self._environment)
                 towards, values = -directions, 4 * np.pi * radiance
-            self._exact_moments = monomials(towards, MATCHED_DEGREE).T @ values / len(towards)
-        return self._exact_moments
+            share, total = np.ones(len(towards)), values.sum()
+            if visible_share is not None:
+                share = visible_share(towards)
+                values = values * share[:, None]
+            is_needed = is_uneven(self._environment) or share.min() < 1
+            if is_needed and values.sum() > LEAST_VISIBLE * total:
+                moments = monomials(towards, MATCHED_DEGREE).T @ values / len(towards)
+            else:
+                moments = np.zeros((0, 0))
+            self._exact_moments = moments
+        return self._exact_moments if self._exact_moments.size else None
 
     def _sampled_radiance(self) -> tuple[np.ndarray, np.ndarray]:
         """Sample the environment; return directions (n, 3) towards it, and their radiance over the
@@ -385,24 +413,31 @@ def _matching_factors(
     """Return factors (n, channels) of the ``irradiance`` (n, channels) with which its sums times
     the ``polynomials`` (n, m) are ``exact`` (m, channels).
 
-    They are 1 plus a polynomial, of the largest degree for which they are not too small.
+    They are 1 plus a polynomial. Its degree grows as long as no factor becomes too small: the last
+    step is then made in part, so that sums of lower degree are exact, and others nearly so.
     """
     factors = np.ones_like(irradiance)
     for c, own in enumerate(irradiance.T):
-        for degree in range(MATCHED_DEGREE, -1, -1):
-            used = [n for n, power in enumerate(powers(MATCHED_DEGREE)) if sum(power) <= degree]
-            basis = polynomials[:, used]
+        used = own > 0
+        for degree in range(MATCHED_DEGREE + 1):
+            count = sum(sum(power) <= degree for power in powers(MATCHED_DEGREE))
+            basis = polynomials[:, :count]
             weighted = basis * own[:, None]
-            missing = exact[used, c] - weighted.sum(axis=0)
+            missing = exact[:count, c] - weighted.sum(axis=0)
             if not np.isfinite(missing).all():  # a map without radiance, or with texels of NaN
                 break
             change, *_ = np.linalg.lstsq(basis.T @ weighted, missing, rcond=1e-6)
             found = 1 + basis @ change
             left = missing - weighted.T @ (found - 1)
             # Few ordinates have not all of the moments.
-            is_exact = np.abs(left).max() <= INEXACT * abs(exact[0, c])
-            if is_exact and found[own > 0].min(initial=1.0) >= SMALLEST_FACTOR:
-                factors[:, c] = found
+            if np.abs(left).max() > INEXACT * abs(exact[0, c]):
+                break
+            before, after = factors[used, c], found[used]
+            falling = after < SMALLEST_FACTOR
+            steps = (before - SMALLEST_FACTOR)[falling] / (before - after)[falling]
+            step = steps.min(initial=1.0)
+            factors[:, c] += step * (found - factors[:, c])
+            if step < 1:
                 break
     return factors
 

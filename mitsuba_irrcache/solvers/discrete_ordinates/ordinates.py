@@ -253,9 +253,11 @@ def boundary_ordinate_sets(
     many = BOUNDARY_ORDINATES_IN_GLASS if flat else BOUNDARY_ORDINATES
     many = max(many // 2, pairs) if several else pairs
     # The first set is independent; the union of the others is evenly distributed.
-    sets = illumination.ordinates(1, many, rng)
+    # In glass, radiance of the environment enters by refraction.
+    share = None if boundary.refracts else partial(boundary.visible_share, tracks)
+    sets = illumination.ordinates(1, many, rng, share)
     if several:
-        sets += illumination.ordinates(passes - 1, many, rng)
+        sets += illumination.ordinates(passes - 1, many, rng, share)
     if joint:
         scattering = [each.scattering() for each in sets]
     else:
