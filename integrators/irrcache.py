@@ -108,8 +108,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
          those along which surfaces illuminate the medium. 0: 128 directions, 256 for forward peaks;
          64 with surfaces unless emitters are in the medium; twice as many for single
          isotropic scattering; 64 for all orders of it under constant environments; ``path``: 16 to
-         256 samples, about 2^24 for all voxels, 2^22 with surfaces, 2^23 behind glass. Values above
-         these multiply the rays that gather irradiance on surfaces, too. (Default: 0)
+         256 samples, about 2^24 for all voxels, 2^22 with surfaces, 2^23 behind glass, and up to
+         4 times as many where few of them meet what emits. Values above these multiply the rays
+         that gather irradiance on surfaces, too. (Default: 0)
 
      * - cache_seed
        - |int|

@@ -62,9 +62,12 @@ SMALL_DEPTH = 0.15
 #: few directions meet are 0.4 % too dark with 0.03, 1 to 3 % with 0.12 (14 % in parts), 2 to 4 %
 #: with 0.2, and 40 % with 0.7.
 LARGE_VARIANCE = 0.06
-#: The same for voxels around a sensor within the medium, weighted by the radiance that it receives
-#: from them: images from within haze of ten mean free paths have errors of 2 to 5 % with 0.1, and 4
-#: to 15 % with 0.3.
+#: Relative variance that paths from each voxel reach by default with up to MOST_SAMPLES times as
+#: many samples, where the default number does not suffice.
+SMALL_VARIANCE, MOST_SAMPLES = 0.03, 4
+#: LARGE_VARIANCE for voxels around a sensor within the medium, weighted by the radiance that it
+#: receives from them: images from within haze of ten mean free paths have errors of 2 to 5 % with
+#: 0.1, and 4 to 15 % with 0.3.
 LARGE_VARIANCE_AROUND_SENSOR = 0.06
 #: Noise of directions that voxels share, above which a warning is logged. It is 1 to 1.5 % in most
 #: scenes with surfaces; with 1.6 to 2 % parts of images are off by up to 6 %, with 2.5 to 4 % means
@@ -201,7 +204,7 @@ class CachedMedium:
         """
         if self.is_dark:
             return 1
-        return 1 << max(self.cache.samples // self.target(0), 1).bit_length() - 1
+        return 1 << max(self.cache.samples // self._default_target, 1).bit_length() - 1
 
     @property
     def is_dark(self) -> bool:
@@ -228,6 +231,8 @@ class CachedMedium:
         if self.cache is None or self.cache.samples >= self.target(samples):
             return closed
         self._fill(scene, self.target(samples) - self.cache.samples, progress)
+        if not samples and self._default_target > self.cache.samples:
+            self._fill(scene, self._default_target - self.cache.samples, progress)
         if not self.is_dark and not self.cache.is_finite:
             self.cache, self._kept_solver = self._start_cache(scene, edited=False), None
             raise IrrcacheError(
@@ -239,6 +244,18 @@ class CachedMedium:
             self._warn_of_noise(scene)
             self._warn_of_neglected_moments(scene)
         return True
+
+    @property
+    def _default_target(self) -> int:
+        """Default samples per voxel of a cache that has at least `target` of them: as many as
+        reduce the variance of paths from each voxel to `SMALL_VARIANCE`, or as far as
+        `MOST_SAMPLES` permits.
+        """
+        if self.is_dark or self.solver.name != "path" or not self.cache.has_own_errors:
+            return self.target(0)
+        needed = self.cache.samples * self.cache.relative_variance / SMALL_VARIANCE
+        default = self.target(0)
+        return self.target(int(min(max(needed, default), MOST_SAMPLES * default)))
 
     def _warn_of_neglected_moments(self, scene: mi.Scene) -> None:
         """Log a warning, once for a cache, if the order of the moments of the radiance is too low
