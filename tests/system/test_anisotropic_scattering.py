@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -66,21 +67,28 @@ def ratio_to_isotropic(scenes, g: float, to: list, surroundings: dict, integrato
     """Return the ratio of radiance that a thin medium scatters with ``g`` to that with 0; rays go
     in the direction ``to``, with black behind the medium.
     """
+    found = []
+    for phase in ({"type": "isotropic"}, hg(g)):
+        scene = thin_medium(scenes, phase, to, surroundings, integrator)
+        found.append(np.array(mi.render(scene, spp=256), dtype=np.float64).mean())
+    return found[1] / found[0]
+
+
+def thin_medium(
+    scenes, phase: dict, to: list, surroundings: dict, integrator: dict, **properties
+) -> mi.Scene:
+    """Return a cube of optical depth 0.02 that parallel rays cross in the direction ``to``."""
     origin = -3 * np.array(to) / np.linalg.norm(to)
     camera = {
         "type": "orthographic",
         "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 1, 0]),
         "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
     }
-    found = []
-    for phase in ({"type": "isotropic"}, hg(g)):
-        medium = scenes.medium(0.01, 0.8) | {"phase": phase}
-        boundary = scenes.boundary(medium, scenes.placement((2, 2, 2)))
-        scene = {"type": "scene", "cloud": boundary, "sensor": camera} | surroundings
-        integrator = {"type": "irrcache", "resolution": 4} | integrator
-        scene = mi.load_dict(scene | {"integrator": integrator})
-        found.append(np.array(mi.render(scene, spp=256), dtype=np.float64).mean())
-    return found[1] / found[0]
+    medium = scenes.medium(0.01, 0.8) | {"phase": phase} | properties
+    boundary = scenes.boundary(medium, scenes.placement((2, 2, 2)))
+    scene = {"type": "scene", "cloud": boundary, "sensor": camera} | surroundings
+    integrator = {"type": "irrcache", "resolution": 4} | integrator
+    return mi.load_dict(scene | {"integrator": integrator})
 
 
 def ratio_below_half_a_sky(g: float, to: list) -> float:
@@ -119,6 +127,31 @@ def test_a_forward_peak_scatters_light_from_above_the_horizon(scenes, g, height,
     to = [0, height, -1]
     found = ratio_to_isotropic(scenes, g, to, surroundings, {"cache_spp": 2048})
     assert found == pytest.approx(ratio_below_half_a_sky(g, to), rel=0.04)
+
+
+@pytest.mark.parametrize("parameter", ["sky.data", "cloud.interior_medium.sigma_t.value.value"])
+@pytest.mark.parametrize("forward", [False, True])
+def test_derivatives_of_light_from_above_the_horizon(scenes, parameter, forward):
+    """Radiance that a thin medium scatters in front of black is proportional to its extinction, and
+    to the radiance of the sky: its derivative with respect to a factor of either is its value.
+    """
+    to, properties = [0, -0.15, -1], {"cache_spp": 512}
+    scene = thin_medium(scenes, hg(0.85), to, {"sky": half_sky()}, properties)
+    parameters = mi.traverse(scene)
+    expected = np.array(mi.render(scene, spp=1024), dtype=np.float64).sum()
+    factor, value = mi.Float(1), parameters[parameter]
+    dr.enable_grad(factor)
+    attached = value * (factor if isinstance(value, mi.TensorXf) else mi.Color3f(factor))
+    parameters[parameter] = attached
+    parameters.update()
+    image = mi.render(scene, parameters, spp=1024, seed=1)
+    if forward:
+        dr.forward(factor)
+        found = np.array(dr.grad(image), dtype=np.float64).sum()
+    else:
+        dr.backward(dr.sum(image))
+        found = float(dr.grad(factor)[0])
+    assert found == pytest.approx(expected, rel=0.03)
 
 
 def black_ground() -> dict:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from experiments.robustness.mutation.mutants import Mutant
+from experiments.robustness.mutation.mutants import PHASE, Mutant
 
 AMONG = "tests/system/test_surfaces_among_voxels.py"
 CROSSINGS = "tests/unit/solvers/discrete_ordinates/test_crossings.py"
@@ -294,5 +294,61 @@ SURFACES = (
         "march._neighbours = [each.indirect() for each in marches], factor",
         "march._neighbours = None",
         (AMONG_SURFACES,),
+    ),
+    Mutant(
+        "forward peaks scatter what is straight behind",
+        "render/camera.py",
+        "background += weight * peaked * (other - radiance)",
+        "pass",
+        (PHASE,),
+    ),
+    Mutant(
+        "forward peaks scatter all that passes",
+        "render/camera.py",
+        "peaked = transmittance - unscattered\n",
+        "peaked = transmittance\n",
+        (PHASE,),
+    ),
+    Mutant(
+        "forward peaks scatter no environment in front of surfaces",
+        "render/blurred_background.py",
+        "change.environment += weight * dr.select(clear, radiance, 0)",
+        "pass",
+        (PHASE,),
+    ),
+    Mutant(
+        "forward peaks scatter positive parts only",
+        "media/peak_blur.py",
+        "np.diff(signed) * ANGLES",
+        "np.abs(np.diff(signed)) * ANGLES",
+        ("tests/unit/media/test_peak_blur.py",),
+    ),
+    Mutant(
+        "derivatives neglect what surrounds a ray",
+        "gradients/medium.py",
+        "behind = behind[0] + blurred, behind[1] - blurred",
+        "pass",
+        (PHASE,),
+    ),
+    Mutant(
+        "derivatives by texels neglect what surrounds a ray",
+        "gradients/medium.py",
+        "self._emitters.add_background(direction, weight)",
+        "pass",
+        (PHASE,),
+    ),
+    Mutant(
+        "moments of an environment that surfaces do not occlude",
+        "solvers/discrete_ordinates/incident.py",
+        "irradiance = irradiance * visible_share(towards)[:, None]",
+        "pass",
+        (PHASE,),
+    ),
+    Mutant(
+        "no more samples where few paths meet a lamp",
+        "pipeline/cached_medium.py",
+        "if not samples and self._default_target > self.cache.samples:",
+        "if False:",
+        ("tests/system/test_area_lights.py",),
     ),
 )
