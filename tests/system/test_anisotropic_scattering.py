@@ -139,10 +139,9 @@ def test_derivatives_of_light_from_above_the_horizon(scenes, parameter, forward)
     scene = thin_medium(scenes, hg(0.85), to, {"sky": half_sky()}, properties)
     parameters = mi.traverse(scene)
     expected = np.array(mi.render(scene, spp=1024), dtype=np.float64).sum()
-    factor, value = mi.Float(1), parameters[parameter]
+    factor = mi.Float(1)
     dr.enable_grad(factor)
-    attached = value * (factor if isinstance(value, mi.TensorXf) else mi.Color3f(factor))
-    parameters[parameter] = attached
+    parameters[parameter] = parameters[parameter] * factor
     parameters.update()
     image = mi.render(scene, parameters, spp=1024, seed=1)
     if forward:
