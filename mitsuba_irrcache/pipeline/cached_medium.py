@@ -251,7 +251,7 @@ class CachedMedium:
         reduce the variance of paths from each voxel to `SMALL_VARIANCE`, or as far as
         `MOST_SAMPLES` permits.
         """
-        if self.is_dark or self.solver.name != "path" or not self.cache.has_own_errors:
+        if self.is_dark or self.solver.is_correlated or not self.cache.has_own_errors:
             return self.target(0)
         needed = self.cache.samples * self.cache.relative_variance / SMALL_VARIANCE
         default = self.target(0)

@@ -49,6 +49,29 @@ def lamp(towards: np.ndarray, radius: float = 0.3) -> dict:
     return {"lamp": {"type": "sphere", "to_world": place, "emitter": emitter}}
 
 
+def half_a_sky(degrees: float) -> dict:
+    """Return an environment with an edge at this angle above the camera's axis, black below it."""
+    texels = np.zeros((64, 128, 3), np.float32)
+    texels[:32] = 1
+    ahead, angle = -CAMERA, np.deg2rad(degrees)
+    up = np.cross(np.cross(ahead, [0, 1, 0]), ahead)
+    up = np.cos(angle) * up / np.linalg.norm(up) - np.sin(angle) * ahead
+    turn = mi.ScalarTransform4f().rotate(
+        np.cross([0, 1, 0], up).tolist(), float(np.rad2deg(np.arccos(up[1])))
+    )
+    return {"sky": {"type": "envmap", "bitmap": mi.Bitmap(texels), "to_world": turn}}
+
+
+def sky_above_ground(reflectance: float) -> dict:
+    """Return a uniform environment, and ground that ends in the upper part of the image."""
+    place = mi.ScalarTransform4f().translate([0, -1.05, 0]).rotate([1, 0, 0], -90).scale(8)
+    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}}
+    return {
+        "ground": {"type": "rectangle", "to_world": place, "bsdf": diffuse},
+        "sky": {"type": "constant", "radiance": 1.0},
+    }
+
+
 #: Emitters (with further objects) and the medium; all orders of scattering.
 CASES: dict[str, Callable[[], tuple[dict, dict]]] = {
     **{
@@ -76,6 +99,21 @@ CASES: dict[str, Callable[[], tuple[dict, dict]]] = {
             ("sun", sun, 0.85, 1), ("sun", sun, 0.85, 4), ("sun", sun, 0.7, 4),
             ("point", point, 0.85, 4), ("lamp", lamp, 0.85, 4),
         )
+    },
+    **{
+        f"edge of a sky {angle} degrees above the axis, g {g}, depth {depth}": (
+            lambda angle=angle, g=g, depth=depth: (half_a_sky(angle), cloud(g, depth))
+        )
+        for angle, g, depth in (
+            (3, 0.85, 1), (3, 0.85, 4), (3, 0.85, 10), (3, 0.7, 4), (15, 0.85, 4), (15, 0.7, 4),
+            (60, 0.85, 4),
+        )
+    },
+    **{
+        f"sky above ground of albedo {albedo}, g {g}, depth 4": (
+            lambda albedo=albedo, g=g: (sky_above_ground(albedo), cloud(g, 4))
+        )
+        for albedo, g in ((0.0, 0.85), (0.06, 0.85), (0.3, 0.85), (0.06, 0.7))
     },
 }  # fmt: skip
 
