@@ -56,9 +56,9 @@ def half_a_sky(degrees: float) -> dict:
     ahead, angle = -CAMERA, np.deg2rad(degrees)
     up = np.cross(np.cross(ahead, [0, 1, 0]), ahead)
     up = np.cos(angle) * up / np.linalg.norm(up) - np.sin(angle) * ahead
-    turn = mi.ScalarTransform4f().rotate(
-        np.cross([0, 1, 0], up).tolist(), float(np.rad2deg(np.arccos(up[1])))
-    )
+    axis = np.cross([0, 1, 0], up)
+    axis, angle = axis / np.linalg.norm(axis), np.rad2deg(np.arccos(up[1]))
+    turn = mi.ScalarTransform4f().rotate(axis.tolist(), float(angle))
     return {"sky": {"type": "envmap", "bitmap": mi.Bitmap(texels), "to_world": turn}}
 
 
