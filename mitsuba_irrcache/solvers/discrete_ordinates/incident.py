@@ -436,7 +436,8 @@ def _matching_factors(
             falling = after < SMALLEST_FACTOR
             steps = (before - SMALLEST_FACTOR)[falling] / (before - after)[falling]
             step = steps.min(initial=1.0)
-            factors[:, c] += step * (found - factors[:, c])
+            # A polynomial may have any value where none of the positions sees the environment.
+            factors[used, c] += step * (after - before)
             if step < 1:
                 break
     return factors
