@@ -77,12 +77,14 @@ def surroundings_change(
 ) -> SurroundingsChange:
     """Estimate by how much the blur changes the radiance of surfaces and of the environment.
 
-    ``ray`` starts within the medium; ``escaped`` states whether it hits no surface. The radiance of
-    surfaces is assumed not to vary within the blur where the ray hits one.
+    ``ray`` starts within the medium; ``escaped`` states whether it hits no surface.
     """
+    has_environment = scene.environment() is not None
     u = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
     chosen_by = rng.next_float32(active)
-    before = dr.select(escaped, environment_along(scene, ray, ray.d), 0)
+    before = mi.Spectrum(0)
+    if has_environment:
+        before = dr.select(escaped, environment_along(scene, ray, ray.d), 0)
     change = SurroundingsChange(mi.Spectrum(0), mi.Float(0), mi.Vector3f(ray.d), mi.Float(0))
     hits = mi.Float(0)
     for direction, weight in blurred_directions(lights, ray.d, depth, u):
@@ -90,12 +92,13 @@ def surroundings_change(
         weight = dr.select(used, weight, 0)
         other = mi.Ray3f(ray.o, direction)
         clear = unobstructed(scene, other, used)
-        radiance = environment_along(scene, ray, direction)
-        change.environment += weight * dr.select(clear, radiance, 0)
-        change.environment -= weight * dr.select(clear | escaped, before, 0)
+        if has_environment:
+            radiance = environment_along(scene, ray, direction)
+            change.environment += weight * dr.select(clear, radiance, 0)
+        change.environment -= weight * before
         change.surface -= dr.select(clear & ~escaped, weight, 0)
         # Choose one of the directions towards surfaces, each with the same probability.
-        hits_surface = used & escaped & ~clear
+        hits_surface = used & ~clear
         hits += dr.select(hits_surface, 1, 0)
         chosen = hits_surface & (chosen_by * hits < 1)
         chosen_by = dr.select(
@@ -104,6 +107,7 @@ def surroundings_change(
         change.direction = dr.select(chosen, direction, change.direction)
         change.weight = dr.select(chosen, weight, change.weight)
     change.weight *= hits
+    change.surface -= dr.select(escaped, 0, change.weight)
     return change
 
 

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.cache.area_light import moments_of
+from mitsuba_irrcache.cache.area_light import AreaLight, moments_of
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.cache.surface import SurfaceNodes
 from mitsuba_irrcache.cache.uncertainty import uncertainty_of
@@ -45,6 +45,7 @@ from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
+    emitter_behind,
     is_null,
     medium_after,
 )
@@ -295,6 +296,21 @@ class _StraightRay:
     active: mi.Bool
 
 
+@dataclass
+class _PathBehind:
+    """The beginning of a path behind media: a ``ray`` in the medium ``pointer``, which has
+    ``travelled`` this distance from the camera; the factors of the radiance that it finds, and of
+    that of emitters at the first surface.
+    """
+
+    ray: mi.Ray3f
+    pointer: mi.MediumPtr
+    travelled: mi.Float
+    weight: mi.Spectrum
+    direct_weight: mi.Spectrum
+    active: mi.Bool
+
+
 class TracedCameraRays:
     """Camera rays through several ``projections``, one for each visible medium."""
 
@@ -390,48 +406,38 @@ class TracedCameraRays:
         chance = dr.minimum(dr.max(transmittance) * (1 / least), 1)
         traced = marched.stopped & (rng.next_float32(marched.stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
-        travelled, is_deflected = marched.near, mi.Bool(False)
-        if self.narrow is not None and scene.environment() is not None:
+        is_stratified = isinstance(sampler, CameraSampler)
+        if self.caches_surfaces and not is_stratified:
+            on_emitter = EmitterSample(sampler.next_2d(traced))
+        else:
+            on_emitter = sampler.emitter_sample() if is_stratified else None
+        path = _PathBehind(end, pointer, marched.near, weight, weight, traced)
+        if self.narrow is None:
+            direct, reflected, straight = self._radiance_behind(scene, path, rng, on_emitter)
+            found = weight * (direct + reflected)
+        else:
             change = self._surroundings_change(scene, ray, marched, rng, active)
             background += marched.peaked * change.environment
-            weight += dr.select(traced, marched.peaked * change.surface / chance, 0)
-            # Rays that leave the scene have no path yet: follow the one towards a surface.
+            path.weight += dr.select(traced, marched.peaked * change.surface / chance, 0)
+            lamp = self._is_lamp(scene, ray.o, marched.segment, traced)
+            path.direct_weight = dr.select(lamp, unscattered / chance, path.weight)
+            # The peak scatters radiance of another surface, too: follow a path towards it.
             towards = marched.peaked * change.weight
-            probability = dr.minimum(dr.max(dr.abs(towards)) * (1 / least), 1)
-            is_deflected = marched.escaped & (rng.next_float32(active) < probability)
-            weight = dr.select(is_deflected, towards / probability, weight)
-            traced |= is_deflected
-            inside = mi.Ray3f(ray(marched.middle), change.direction, ray.time, ray.wavelengths)
-            end = dr.select(is_deflected, inside, end)
-            pointer = dr.select(is_deflected, dr.zeros(mi.MediumPtr), pointer)
-            travelled = dr.select(is_deflected, marched.middle, travelled)
-        is_stratified = isinstance(sampler, CameraSampler)
-        if self.caches_surfaces:
-            if is_stratified:
-                on_emitter = sampler.emitter_sample()
-            else:
-                on_emitter = EmitterSample(sampler.next_2d(traced))
-            direct, reflected, straight, *_ = self._surfaces.paths.follow(
-                scene, end, pointer, rng, traced, on_emitter, self.hide_emitters, travelled
+            chance_towards = dr.minimum(dr.max(dr.abs(towards)) * (1 / least), 1)
+            end = mi.Ray3f(ray(marched.middle), change.direction, ray.time, ray.wavelengths)
+            towards /= dr.maximum(chance_towards, 1e-30)
+            is_followed = active & (rng.next_float32(active) < chance_towards)
+            lamp = self._is_lamp(scene, end.o, end, is_followed)
+            deflected = _PathBehind(
+                end,
+                dr.zeros(mi.MediumPtr, dr.width(end)),
+                mi.Float(marched.middle),
+                towards,
+                dr.select(lamp, 0, towards),
+                is_followed,
             )
-        else:
-            sample = sampler.emitter_sample().u if is_stratified else None
-            start = PathStart(end, pointer, depth=0, pdf=0.0, clear=True, sample=sample)
-            depths = self.max_depth, self.rr_depth
-            is_cached = self._is_cached if self._ends_in_media else None
-            paths = PathTracer(scene, self.media, *depths, self.hide_emitters, is_cached)
-            sums, _ = paths.trace(start, rng, traced)
-            direct, reflected = sums.direct, sums.scattered
-            straight = dr.select(sums.interacted, 0, mi.Spectrum(1))
-            if self._ends_in_media:
-                reflected += sums.end.weight * self._irradiance(sums.end) * dr.inv_four_pi
-        direct_weight = weight
-        if self.narrow is not None:
-            lamp = self.narrow.hits_source(ray.o, ray.d, far=mi.Bool(False), near=traced)
-            direct_weight = dr.select(lamp, unscattered / chance, weight)
-            lamp = self.narrow.hits_source(end.o, end.d, far=mi.Bool(False), near=is_deflected)
-            direct_weight = dr.select(lamp, 0, direct_weight)
-        background += dr.select(traced, direct_weight * direct + weight * reflected, 0)
+            found, straight = self._both_behind(scene, path, deflected, rng, on_emitter)
+        background += dr.select(traced | (self.narrow is not None), found, 0)
         alpha = mi.Float(1)
         if self.hide_emitters or scene.environment() is None:
             passed = weight
@@ -441,6 +447,79 @@ class TracedCameraRays:
             transparency = dr.select(marched.escaped, transmittance, transparency)
             alpha = 1 - dr.sum(transparency) / dr.size_v(mi.Spectrum)
         return RayResult(marched.scattered, background, transmittance, alpha, marched.gathered)
+
+    def _is_lamp(
+        self, scene: mi.Scene, origin: mi.Point3f, ray: mi.Ray3f, active: mi.Bool
+    ) -> mi.Bool:
+        """Return whether ``ray``, on a line with ``origin``, hits an emitter whose radiance that
+        the forward peak scatters is part of the scattered radiance along camera rays.
+        """
+        narrow = self.narrow.hits_source(origin, ray.d, far=mi.Bool(False), near=active)
+        if not self._direct_emitters:
+            return narrow
+        return narrow | self._is_direct(emitter_behind(scene, ray, active), active)
+
+    def _is_direct(self, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Bool:
+        """Return whether ``emitter`` is a direct light of a medium with a forward peak."""
+        found = mi.Bool(False)
+        for each in self._direct_emitters:
+            found |= active & (emitter == mi.EmitterPtr(each))
+        return found
+
+    @property
+    def _direct_emitters(self) -> list[mi.Emitter]:
+        peaked = (p for p in self.projections if p.truncates_peak)
+        return [
+            d.light.emitter
+            for p in peaked
+            for d in p.direct_lights
+            if isinstance(d.light, AreaLight)
+        ]
+
+    def _radiance_behind(
+        self,
+        scene: mi.Scene,
+        path: _PathBehind,
+        rng: mi.PCG32,
+        on_emitter: EmitterSample | None,
+    ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
+        """Follow a path; return the radiance of emitters at the first surface, all other radiance,
+        and the transmittance of paths without any vertex (0 for others).
+        """
+        if self.caches_surfaces:
+            rest = rng, path.active, on_emitter, self.hide_emitters, path.travelled
+            found = self._surfaces.paths.follow(scene, path.ray, path.pointer, *rest)
+            return found[:3]
+        sample = on_emitter.u if on_emitter is not None else None
+        start = PathStart(path.ray, path.pointer, depth=0, pdf=0.0, clear=True, sample=sample)
+        depths = self.max_depth, self.rr_depth
+        is_cached = self._is_cached if self._ends_in_media else None
+        paths = PathTracer(scene, self.media, *depths, self.hide_emitters, is_cached)
+        sums, _ = paths.trace(start, rng, path.active)
+        reflected = sums.scattered
+        if self._ends_in_media:
+            reflected += sums.end.weight * self._irradiance(sums.end) * dr.inv_four_pi
+        return sums.direct, reflected, dr.select(sums.interacted, 0, mi.Spectrum(1))
+
+    @symbolic
+    def _both_behind(self, scene, path, deflected, rng, on_emitter):
+        """Return the weighted radiance of two paths, and the third result of `_radiance_behind` for
+        the first one.
+
+        Both use the same random numbers, so that their difference has little noise.
+        """
+        total, straight, number = mi.Spectrum(0), mi.Spectrum(0), mi.UInt32(0)
+        current = path
+        active = path.active | deflected.active
+        while dr.hint(active, label="paths behind media"):
+            direct, reflected, passed = self._radiance_behind(scene, current, rng, on_emitter)
+            radiance = current.direct_weight * direct + current.weight * reflected
+            total += dr.select(current.active, radiance, 0)
+            straight = dr.select(number == 0, passed, straight)
+            number += 1
+            current = dr.select(number == 1, deflected, current)
+            active &= (number == 1) & deflected.active
+        return total, straight
 
     def _surroundings_change(
         self,
@@ -562,6 +641,7 @@ class TracedCameraRays:
             narrow = self.narrow.hits_source(
                 ray.o, ray.d, hit_emitter & ~valid, hit_emitter & valid
             )
+            narrow |= self._is_direct(emitter, hit_emitter & valid)
             attenuation = dr.select(narrow, state.unscattered, attenuation)
             # Forward peaks scatter radiance of hidden emitters into the ray.
             attenuation -= dr.select(hidden, state.unscattered, 0)

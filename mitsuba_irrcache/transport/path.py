@@ -221,6 +221,24 @@ def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
 
 
 @symbolic
+def emitter_behind(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
+    """Return the emitter of the first surface on ``ray`` that is not null; None where there is
+    none.
+    """
+    ray, active = mi.Ray3f(ray), mi.Bool(active)
+    found, crossings = dr.zeros(mi.EmitterPtr, dr.width(active)), mi.UInt32(0)
+    while dr.hint(active, label="emitter behind"):
+        si = scene.ray_intersect(ray, active)
+        hit = active & si.is_valid()
+        null = is_null(si.bsdf().flags())
+        found = dr.select(hit & ~null, si.emitter(scene, hit), found)
+        ray = si.spawn_ray(ray.d)
+        crossings += 1
+        active &= hit & null & (crossings < MOST_CROSSINGS)
+    return found
+
+
+@symbolic
 def unobstructed(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
     """Return whether no surface but null ones lies on ``ray`` up to its end."""
     ray, clear, active = mi.Ray3f(ray), mi.Bool(active), mi.Bool(active)

@@ -71,6 +71,15 @@ class AnisotropicSweep(Sweep):
         ]
         return [self._of_channel(c, *each) for c, *each in zip(channels, *parts, strict=True)]
 
+    def _irradiance_of(self, values: mi.Float) -> mi.Float:
+        return self._moments.moment(values, 0) if dr.width(values) > 1 else values
+
+    @property
+    def _noise_of_scattering(self) -> float:
+        # The noise of few directions is about the same for all moments.
+        moments = self._moments.angular_basis.phase.moments
+        return sum(float(moments[degree]) ** 2 for degree in self._moments.degrees)
+
     def _of_channel(
         self,
         channel: int,

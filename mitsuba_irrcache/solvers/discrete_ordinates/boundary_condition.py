@@ -50,6 +50,9 @@ from mitsuba_irrcache.transport.path_tracer import PathStart, PathTracer
 #: separate these. Then every track has its own path on grids of up to about 140^3 voxels; on
 #: larger ones 2 x 2 tracks share one, to limit the memory.
 PATH_CELLS, EMITTER_CELLS, SEPARATED_CELLS = 1 << 11, 1 << 16, 1 << 15
+#: Total number of cells of ordinates of the second kind, at most: if there are many of these, each
+#: matters less.
+MOST_EMITTER_CELLS = 1 << 20
 #: Paths begin at this distance inside the box [voxels]: surfaces may lie on its faces.
 INSET = 1e-3
 #: Offset of the random streams of paths from surfaces among the voxels.
@@ -172,7 +175,9 @@ class IncomingRadiance:
         self._geometry = tracks.table(directions, incoming[..., 0], weights, offsets).geometry
         is_divided = boundary.surfaces is not None and boundary.surfaces.meet_faces
         path_cells = SEPARATED_CELLS if is_divided else PATH_CELLS
-        self._lay_out_cells(np.where(weights > 0, path_cells, EMITTER_CELLS))
+        emitter_cells = MOST_EMITTER_CELLS // max((weights == 0).sum(), 1)
+        emitter_cells = np.clip(emitter_cells, path_cells, EMITTER_CELLS)
+        self._lay_out_cells(np.where(weights > 0, path_cells, emitter_cells))
         #: where tracks cross surfaces among the voxels
         self.crossings = boundary.crossings(tracks, ordinates)
         parameters = self._parameters(directions, parts, weights)
