@@ -414,7 +414,7 @@ class TracedCameraRays:
         path = _PathBehind(end, pointer, marched.near, weight, weight, traced)
         if self.narrow is None:
             direct, reflected, straight = self._radiance_behind(scene, path, rng, on_emitter)
-            found = weight * (direct + reflected)
+            found = dr.select(traced, weight * (direct + reflected), 0)
         else:
             change = self._surroundings_change(scene, ray, marched, rng, active)
             background += marched.peaked * change.environment
@@ -437,7 +437,7 @@ class TracedCameraRays:
                 is_followed,
             )
             found, straight = self._both_behind(scene, path, deflected, rng, on_emitter)
-        background += dr.select(traced | (self.narrow is not None), found, 0)
+        background += found
         alpha = mi.Float(1)
         if self.hide_emitters or scene.environment() is None:
             passed = weight

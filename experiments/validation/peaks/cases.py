@@ -72,6 +72,24 @@ def sky_above_ground(reflectance: float) -> dict:
     }
 
 
+def two_grounds() -> dict:
+    """Return a uniform environment, and ground of which one half is black and one bright."""
+    found = {"sky": {"type": "constant", "radiance": 1.0}}
+    for side, value in ((-1, 0.0), (1, 0.9)):
+        place = mi.ScalarTransform4f().translate([8 * side, -1.05, 0]).rotate([1, 0, 0], -90)
+        diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": value}}
+        shape = {"type": "rectangle", "to_world": place.scale(8), "bsdf": diffuse}
+        found[f"ground_{side}"] = shape
+    return found
+
+
+def panel() -> dict:
+    """Return a wide area emitter behind the cube, which covers most of the image."""
+    place = mi.ScalarTransform4f().look_at((-3 * CAMERA).tolist(), [0, 0, 0], [0, 1, 0]).scale(6)
+    emitter = {"type": "area", "radiance": 1.0}
+    return {"panel": {"type": "rectangle", "to_world": place, "emitter": emitter}}
+
+
 #: Emitters (with further objects) and the medium; all orders of scattering.
 CASES: dict[str, Callable[[], tuple[dict, dict]]] = {
     **{
@@ -115,6 +133,8 @@ CASES: dict[str, Callable[[], tuple[dict, dict]]] = {
         )
         for albedo, g in ((0.0, 0.85), (0.06, 0.85), (0.3, 0.85), (0.06, 0.7))
     },
+    "sky above ground of two albedos, g 0.85, depth 4": lambda: (two_grounds(), cloud(0.85, 4)),
+    "wide emitter behind, g 0.85, depth 4": lambda: (panel(), cloud(0.85, 4)),
 }  # fmt: skip
 
 
