@@ -285,8 +285,7 @@ def test_noise_of_light_through_a_hole(scenes, g):
 @pytest.mark.parametrize("g", [0, 0.5])
 def test_noise_of_light_through_a_hole_is_warned_of(scenes, logged, monkeypatch, g):
     """The same with as few ordinates as elsewhere: a warning, also with anisotropic scattering."""
-    monkeypatch.setattr(incident, "FURTHER_ORDINATES", ())
-    monkeypatch.setattr(incident, "LEAST_FURTHER", 0)
+    monkeypatch.setattr(incident, "_further_ordinates", lambda *_: 0)
     mi.render(in_surroundings(scenes, g, ground_with_a_hole()), spp=1)
     assert any("neighbouring voxels share" in message for message in logged)
 

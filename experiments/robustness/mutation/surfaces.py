@@ -347,15 +347,15 @@ SURFACES = (
     Mutant(
         "no more ordinates through openings",
         "solvers/discrete_ordinates/incident.py",
-        "for least, count in FURTHER_ORDINATES if variation > least * visible",
-        "for least, count in ()",
+        "for above, count in levels if variation > above",
+        "for above, count in ()",
         (PHASE,),
     ),
     Mutant(
         "no more ordinates for anisotropic scattering",
         "solvers/discrete_ordinates/incident.py",
-        "self._further = max(self._further, LEAST_FURTHER)",
-        "pass",
+        "least = 0 if is_isotropic else LEAST_FURTHER",
+        "least = 0",
         (PHASE,),
     ),
     Mutant(

@@ -76,9 +76,10 @@ class AnisotropicSweep(Sweep):
 
     @property
     def _noise_of_scattering(self) -> float:
-        # The noise of few directions is about the same for all moments.
+        # The noise of few directions is about the same for all moments. Half of it corresponds to
+        # the errors of images as that of the irradiance does for isotropic scattering.
         moments = self._moments.angular_basis.phase.moments
-        return sum(float(moments[degree]) ** 2 for degree in self._moments.degrees)
+        return 0.5 * sum(float(moments[degree]) ** 2 for degree in self._moments.degrees)
 
     def _of_channel(
         self,
