@@ -418,7 +418,8 @@ class TracedCameraRays:
         else:
             change = self._surroundings_change(scene, ray, marched, rng, active)
             background += marched.peaked * change.environment
-            path.weight += dr.select(traced, marched.peaked * change.surface / chance, 0)
+            surface = marched.peaked * change.surface / chance
+            path.weight = weight + dr.select(traced, surface, 0)
             lamp = self._is_lamp(scene, ray.o, marched.segment, traced)
             path.direct_weight = dr.select(lamp, unscattered / chance, path.weight)
             # The peak scatters radiance of another surface, too: follow a path towards it.

@@ -64,23 +64,20 @@ def half_a_sky(degrees: float) -> dict:
 
 def sky_above_ground(reflectance: float) -> dict:
     """Return a uniform environment, and ground that ends in the upper part of the image."""
-    place = mi.ScalarTransform4f().translate([0, -1.05, 0]).rotate([1, 0, 0], -90).scale(8)
+    return {"ground": ground(reflectance), "sky": {"type": "constant", "radiance": 1.0}}
+
+
+def ground(reflectance: float, x: float = 0.0) -> dict:
+    """Return a diffuse square of 16 x 16 slightly below the cube, with its centre at ``x``."""
+    place = mi.ScalarTransform4f().translate([x, -1.05, 0]).rotate([1, 0, 0], -90).scale(8)
     diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}}
-    return {
-        "ground": {"type": "rectangle", "to_world": place, "bsdf": diffuse},
-        "sky": {"type": "constant", "radiance": 1.0},
-    }
+    return {"type": "rectangle", "to_world": place, "bsdf": diffuse}
 
 
 def two_grounds() -> dict:
     """Return a uniform environment, and ground of which one half is black and one bright."""
-    found = {"sky": {"type": "constant", "radiance": 1.0}}
-    for side, value in ((-1, 0.0), (1, 0.9)):
-        place = mi.ScalarTransform4f().translate([8 * side, -1.05, 0]).rotate([1, 0, 0], -90)
-        diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": value}}
-        shape = {"type": "rectangle", "to_world": place.scale(8), "bsdf": diffuse}
-        found[f"ground_{side}"] = shape
-    return found
+    sky = {"type": "constant", "radiance": 1.0}
+    return {"sky": sky, "black": ground(0.0, -8), "bright": ground(0.9, 8)}
 
 
 def panel() -> dict:
