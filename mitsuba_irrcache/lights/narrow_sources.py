@@ -75,13 +75,7 @@ class Source:
 
         The cosine is 2 at points where the source is not narrow.
         """
-        if self.far:
-            return self.place, self._size
-        offset = self.place - mi.Vector3f(p)
-        distance = dr.maximum(dr.norm(offset), TINY)
-        sine = dr.maximum(self._size / distance, MIN_ANGULAR_RADIUS)
-        cosine = dr.select(sine < MAX_LAMP_SINE, dr.sqrt(1 - dr.square(sine)), 2)
-        return offset / distance, cosine
+        return (self.place, self._size) if self.far else _seen(self.place, self._size, p)
 
     def distance(self, p: mi.Point3f) -> mi.Float:
         """Return the distance from ``p`` to the centre of the source, infinite if it is ``far``."""
@@ -116,6 +110,38 @@ class Source:
         False for all unless it is ``far``.
         """
         return (directions @ self._direction >= self._cosine) & self.far
+
+
+class SourceTable:
+    """The values of several sources in arrays, for kernels that do not depend on their number."""
+
+    def __init__(self, sources: Sequence[Source]) -> None:
+        #: number of sources
+        self.count = len(sources)
+        self._place = mi.Vector3f(np.float32([s._direction for s in sources]).reshape(-1, 3).T)
+        self._size = mi.Float([s._size[0] for s in sources])
+        self._far = mi.Bool([s.far for s in sources])
+
+    def seen_from(self, p: mi.Point3f, number: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
+        """Return the same as `Source.seen_from`, of the source with this ``number``."""
+        place, size = (
+            dr.gather(mi.Vector3f, self._place, number),
+            dr.gather(mi.Float, self._size, number),
+        )
+        towards, cosine = _seen(place, size, p)
+        far = dr.gather(mi.Bool, self._far, number)
+        return dr.select(far, place, towards), dr.select(far, size, cosine)
+
+
+def _seen(place: mi.Vector3f, radius: mi.Float, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
+    """Return the direction from ``p`` to a sphere around ``place``, and the cosine of its angular
+    radius; 2 where it is not narrow.
+    """
+    offset = place - mi.Vector3f(p)
+    distance = dr.maximum(dr.norm(offset), TINY)
+    sine = dr.maximum(radius / distance, MIN_ANGULAR_RADIUS)
+    cosine = dr.select(sine < MAX_LAMP_SINE, dr.sqrt(1 - dr.square(sine)), 2)
+    return offset / distance, cosine
 
 
 def sources_of(

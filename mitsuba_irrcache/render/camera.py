@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.cache.area_light import AreaLight, moments_of
+from mitsuba_irrcache.cache.area_light import moments_of
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.cache.surface import SurfaceNodes
 from mitsuba_irrcache.cache.uncertainty import uncertainty_of
@@ -37,6 +37,7 @@ from mitsuba_irrcache.render.blurred_background import (
     surroundings_change,
 )
 from mitsuba_irrcache.render.film import CameraSampler, scattered_rays, view_extent
+from mitsuba_irrcache.render.peak_sources import PeakSources
 from mitsuba_irrcache.render.raymarch import CachedFields, Projection
 from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
 from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance
@@ -45,7 +46,6 @@ from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
-    emitter_behind,
     is_null,
     medium_after,
 )
@@ -330,11 +330,8 @@ class TracedCameraRays:
         #: the projection with most channels: media without a cache have no error estimates
         self.projection = max(projections, key=lambda p: p.channel_count)
         self.hide_emitters = hide_emitters
-        #: narrow sources, whose direct radiance is attenuated by the original extinction (see
-        #: `delta_m`); None if no medium is truncated
-        self.narrow = next(
-            (p.directional.directional for p in projections if p.truncates_peak), None
-        )
+        #: emitters that truncated forward peaks scatter; None if no medium has one
+        self.peak = PeakSources.of(projections)
         #: whether paths may end in media: not with a limited depth, because caches hold the sum of
         #: all orders
         self._ends_in_media = max_depth < 0
@@ -374,7 +371,7 @@ class TracedCameraRays:
         samples = width * height * (spp or sensor.sampler().sample_count())
         self.caches_surfaces = False
         # Shadows of media with a forward peak are sharp with cached irradiance only.
-        is_worth_it = samples >= FEWEST_SAMPLES or self._refracts or self.narrow is not None
+        is_worth_it = samples >= FEWEST_SAMPLES or self._refracts or self.peak is not None
         if self._emitters is None or not is_worth_it:
             return
         view = view_extent(sensor)
@@ -412,7 +409,7 @@ class TracedCameraRays:
         else:
             on_emitter = sampler.emitter_sample() if is_stratified else None
         path = _PathBehind(end, pointer, marched.near, weight, weight, traced)
-        if self.narrow is None:
+        if self.peak is None:
             direct, reflected, straight = self._radiance_behind(scene, path, rng, on_emitter)
             found = dr.select(traced, weight * (direct + reflected), 0)
         else:
@@ -420,7 +417,7 @@ class TracedCameraRays:
             background += marched.peaked * change.environment
             surface = marched.peaked * change.surface / chance
             path.weight = weight + dr.select(traced, surface, 0)
-            lamp = self._is_lamp(scene, ray.o, marched.segment, traced)
+            lamp = self.peak.hit_by(scene, ray.o, marched.segment, mi.Bool(False), traced)
             path.direct_weight = dr.select(lamp, unscattered / chance, path.weight)
             # The peak scatters radiance of another surface, too: follow a path towards it.
             towards = marched.peaked * change.weight
@@ -428,7 +425,7 @@ class TracedCameraRays:
             end = mi.Ray3f(ray(marched.middle), change.direction, ray.time, ray.wavelengths)
             towards /= dr.maximum(chance_towards, 1e-30)
             is_followed = active & (rng.next_float32(active) < chance_towards)
-            lamp = self._is_lamp(scene, end.o, end, is_followed)
+            lamp = self.peak.hit_by(scene, end.o, end, mi.Bool(False), is_followed)
             deflected = _PathBehind(
                 end,
                 dr.zeros(mi.MediumPtr, dr.width(end)),
@@ -442,40 +439,12 @@ class TracedCameraRays:
         alpha = mi.Float(1)
         if self.hide_emitters or scene.environment() is None:
             passed = weight
-            if self.narrow is not None:
+            if self.peak is not None:
                 passed, transmittance = dr.select(traced, unscattered / chance, 0), unscattered
             transparency = dr.select(traced, passed * straight, 0)
             transparency = dr.select(marched.escaped, transmittance, transparency)
             alpha = 1 - dr.sum(transparency) / dr.size_v(mi.Spectrum)
         return RayResult(marched.scattered, background, transmittance, alpha, marched.gathered)
-
-    def _is_lamp(
-        self, scene: mi.Scene, origin: mi.Point3f, ray: mi.Ray3f, active: mi.Bool
-    ) -> mi.Bool:
-        """Return whether ``ray``, on a line with ``origin``, hits an emitter whose radiance that
-        the forward peak scatters is part of the scattered radiance along camera rays.
-        """
-        narrow = self.narrow.hits_source(origin, ray.d, far=mi.Bool(False), near=active)
-        if not self._direct_emitters:
-            return narrow
-        return narrow | self._is_direct(emitter_behind(scene, ray, active), active)
-
-    def _is_direct(self, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Bool:
-        """Return whether ``emitter`` is a direct light of a medium with a forward peak."""
-        found = mi.Bool(False)
-        for each in self._direct_emitters:
-            found |= active & (emitter == mi.EmitterPtr(each))
-        return found
-
-    @property
-    def _direct_emitters(self) -> list[mi.Emitter]:
-        peaked = (p for p in self.projections if p.truncates_peak)
-        return [
-            d.light.emitter
-            for p in peaked
-            for d in p.direct_lights
-            if isinstance(d.light, AreaLight)
-        ]
 
     def _radiance_behind(
         self,
@@ -534,7 +503,7 @@ class TracedCameraRays:
         middle = mi.Ray3f(ray(marched.middle), ray.d, ray.time, ray.wavelengths)
         depth = peak_depth(marched.unscattered + marched.peaked, marched.unscattered)
         active = active & (dr.max(marched.peaked) > 0)
-        lights = self.narrow
+        lights = self.peak.basis
         return surroundings_change(scene, lights, middle, marched.escaped, depth, rng, active)
 
     @symbolic
@@ -605,7 +574,7 @@ class TracedCameraRays:
             state.background += dr.select(shows_emitters, state.transmittance * emitted, 0)
             state.gathered = _added(state.gathered, sums, state.transmittance, scale)
             state.transmittance *= transmittance
-            if self.narrow is not None:
+            if self.peak is not None:
                 crosses = hit & (entry < leave)
                 state.unscattered *= projection.unscattered(
                     transmittance, ray, entry, leave, crosses
@@ -632,18 +601,16 @@ class TracedCameraRays:
         hidden = mi.Bool(False)
         if self.hide_emitters:
             hidden = hit_emitter & (~valid | (state.pointer == None))  # noqa: E711
-            if self.narrow is None:
+            if self.peak is None:
                 hit_emitter = mi.Bool(False)
         crosses = null | (hidden & valid)
         hit_emitter &= crosses | ~valid
         radiance = emitter.eval(si, hit_emitter & shows_emitters)
         attenuation = mi.Spectrum(state.transmittance)
-        if self.narrow is not None:
-            narrow = self.narrow.hits_source(
-                ray.o, ray.d, hit_emitter & ~valid, hit_emitter & valid
-            )
-            narrow |= self._is_direct(emitter, hit_emitter & valid)
-            attenuation = dr.select(narrow, state.unscattered, attenuation)
+        if self.peak is not None:
+            ends = hit_emitter & ~valid, hit_emitter & valid
+            unblurred = self.peak.include(emitter, ray.o, ray.d, *ends)
+            attenuation = dr.select(unblurred, state.unscattered, attenuation)
             # Forward peaks scatter radiance of hidden emitters into the ray.
             attenuation -= dr.select(hidden, state.unscattered, 0)
             state.transmittance = dr.select(hidden, state.unscattered, state.transmittance)

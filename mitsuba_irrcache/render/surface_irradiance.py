@@ -17,9 +17,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import Source
 from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
+from mitsuba_irrcache.lights.narrow_sources import SourceTable
 from mitsuba_irrcache.render.film import ViewExtent
 from mitsuba_irrcache.render.surface_paths import SurfacePaths
 from mitsuba_irrcache.render.surface_vertices import facing, lambertian
@@ -29,9 +29,9 @@ from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 #: Number of rays by which a node measures the distances of its surroundings; by which a node that
 #: camera rays need samples its irradiance; by which other nodes do.
 DISTANCE_RAYS, GATHERED, GATHERED_INDIRECT = 32, 128, 32
-#: Rays by which a node gathers what forward peaks scatter, around each narrow source, and the mean
-#: cosine of the angle between them for a source without extent.
-AROUND_SOURCES, MEAN_COSINE = 32, 0.85
+#: Rays by which a node gathers what forward peaks scatter, per narrow source up to a number of
+#: sources, and the mean cosine of the angle between them for a source without extent.
+AROUND_SOURCES, MOST_AROUND, MEAN_COSINE = 32, 8, 0.85
 #: Nodes of a view up to which all rays are used: more nodes are close to each other, so that their
 #: errors average out within a pixel.
 FINE_NODES = 1 << 15
@@ -261,42 +261,50 @@ class SurfaceIrradiance:
             dr.eval(radiance, other, factor)  # in one launch
             parts = [dr.block_sum(c, rays // PARTS) for c in list(radiance)]
             own = [dr.block_sum(c, PARTS) for c in parts]
-            for source in self.paths.narrow_sources:
-                around = self._gather_around(scene, source, numbers, (p, normals, medium, distance))
+            place = p, normals, medium, distance
+            parts_around = min(self.paths.narrow_sources.count, MOST_AROUND)
+            for number in range(parts_around):
+                around = self._gather_around(scene, numbers, place, number, parts_around)
                 own = [a + b for a, b in zip(own, around, strict=True)]
             mean = PARTS / len(parts) * sum(parts)
             dr.eval(own, mean)
             self._exchange.append(Exchange(rays, own, other, list(factor), mean))
 
     def _gather_around(
-        self, scene: mi.Scene, source: Source, numbers: mi.UInt32, place: tuple
+        self, scene: mi.Scene, numbers: mi.UInt32, place: tuple, part: int, parts: int
     ) -> list[mi.Float]:
-        """Return the irradiance at nodes due to radiance of a narrow ``source`` that truncated
-        forward peaks scatter.
+        """Return a ``part`` of the irradiance at nodes due to radiance of narrow sources that
+        truncated forward peaks scatter, of as many ``parts`` as there are sources or fewer.
 
-        Rays are distributed around the direction of the source like the Henyey-Greenstein phase
-        function, the more broadly the larger the source.
+        Rays are distributed around the directions of the sources like the Henyey-Greenstein phase
+        function, the more broadly the larger a source. Each finds the radiance of all sources, so
+        that its density is the mean of those around each (balance heuristic, Veach and Guibas
+        1995).
         """
         # docs/primer, eq. (5.12)
         p, (geometric, shading), medium, distance = place
+        sources = self.paths.narrow_sources
         lane, k = Divisor(AROUND_SOURCES).split(
             dr.arange(mi.UInt32, dr.width(numbers) * AROUND_SOURCES)
         )
+        k += dr.opaque(mi.UInt32, part * AROUND_SOURCES)
         words = mi.sample_tea_32(
             dr.gather(mi.UInt32, self.nodes.streams(numbers)[1], lane), self._seed
         )
         shift = unit_floats(words)
-        share = dr.opaque(mi.Float, 1 / AROUND_SOURCES)
-        u = (mi.Float(k) + shift[0]) * share, kronecker(k, 1, [shift[1]])[0]
+        share = dr.opaque(mi.Float, 1 / (AROUND_SOURCES * parts))
+        count = dr.opaque(mi.UInt32, sources.count)
         vertex = dr.zeros(mi.Interaction3f, dr.width(lane))
         vertex.p = dr.gather(mi.Point3f, p, lane)
         vertex.n = dr.gather(mi.Normal3f, geometric, lane)
-        towards, cosine = source.seen_from(vertex.p)
-        radius = dr.sqrt(dr.maximum(1 - dr.square(dr.minimum(cosine, 1)), 0))
-        g = MEAN_COSINE * dr.select(cosine > 1, 0.1, dr.maximum(1 - radius, 0.1))
-        local, density = _henyey_greenstein(g, mi.Point2f(*u))
+        chosen_by = (mi.Float(k) + shift[0]) * share * mi.Float(count)
+        number = dr.minimum(mi.UInt32(chosen_by), count - 1)
+        u = dr.minimum(chosen_by - mi.Float(number), 1), kronecker(k, 1, [shift[1]])[0]
+        towards, cosine = sources.seen_from(vertex.p, number)
+        local = _henyey_greenstein(_mean_cosine(cosine), mi.Point2f(*u))
         ray = vertex.spawn_ray(mi.Frame3f(towards).to_world(local))
         normal = dr.gather(mi.Normal3f, shading, lane)
+        density = _mean_density(sources, count, vertex.p, ray.d)
         weight = dr.maximum(dr.dot(normal, ray.d), 0) * share / density
         above = (weight > 0) & (dr.dot(vertex.n, ray.d) > 0)
         active = above & (dr.gather(mi.Float, distance, lane) > 0)
@@ -413,17 +421,34 @@ def _fixed_point(
     return total
 
 
-def _henyey_greenstein(g: mi.Float, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-    """Sample a direction around the z axis with the mean cosine ``g`` > 0; return its density
-    [1/sr], too.
+def _mean_cosine(cosine: mi.Float) -> mi.Float:
+    """Return the mean cosine of the angle between rays and the direction of a source, given the
+    ``cosine`` of its angular radius (`Source.seen_from`).
     """
+    radius = dr.sqrt(dr.maximum(1 - dr.square(dr.minimum(cosine, 1)), 0))
+    return MEAN_COSINE * dr.select(cosine > 1, 0.1, dr.maximum(1 - radius, 0.1))
+
+
+def _henyey_greenstein(g: mi.Float, u: mi.Point2f) -> mi.Vector3f:
+    """Sample a direction around the z axis with the mean cosine ``g`` > 0."""
     ratio = (1 - dr.square(g)) / dr.fma(2 * g, u.x, 1 - g)
     cosine = dr.clip((1 + dr.square(g) - dr.square(ratio)) / (2 * g), -1, 1)
     sine = dr.sqrt(1 - dr.square(cosine))
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
-    base = dr.maximum(1 + dr.square(g) - 2 * g * cosine, 1e-12)
-    density = dr.inv_four_pi * (1 - dr.square(g)) / (base * dr.sqrt(base))
-    return mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine), density
+    return mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine)
+
+
+@symbolic
+def _mean_density(sources: SourceTable, count: mi.UInt32, p: mi.Point3f, direction: mi.Vector3f):
+    """Return the density [1/sr] of rays around ``count`` sources, as many around each."""
+    total, number = mi.Float(0), mi.UInt32(0)
+    while dr.hint(number < count, label="sources"):
+        towards, cosine = sources.seen_from(p, number)
+        g = _mean_cosine(cosine)
+        base = dr.maximum(1 + dr.square(g) - 2 * g * dr.dot(direction, towards), 1e-12)
+        total += dr.inv_four_pi * (1 - dr.square(g)) / (base * dr.sqrt(base))
+        number += 1
+    return total / mi.Float(count)
 
 
 def _joined(parts: Sequence) -> object:

@@ -23,9 +23,10 @@ from mitsuba_irrcache.cache.angular import Scattering
 from mitsuba_irrcache.cache.surface import SpacingBounds, SurfaceNodes
 from mitsuba_irrcache.core.jit import opaque_point, symbolic
 from mitsuba_irrcache.lights.emitters import are_distant
-from mitsuba_irrcache.lights.narrow_sources import Source
+from mitsuba_irrcache.lights.narrow_sources import SourceTable
 from mitsuba_irrcache.render.film import ViewExtent
 from mitsuba_irrcache.render.path_splitting import no_waiting, resumed, split
+from mitsuba_irrcache.render.peak_sources import PeakSources
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
 from mitsuba_irrcache.render.surface_vertices import (
@@ -99,10 +100,9 @@ class SurfacePaths:
             corners = [(p.medium.frame @ UNIT_CUBE)[:3] for p in projections]
             nodes = SurfaceNodes(np.min(corners, axis=(0, 2)), np.max(corners, axis=(0, 2)))
         self.nodes = nodes
-        #: narrow sources, if any medium has a truncated forward peak, and the media before that
-        self.narrow = next(
-            (p.directional.directional for p in projections if p.truncates_peak), None
-        )
+        #: emitters that truncated forward peaks scatter, if any medium has one; the media before
+        #: the truncation
+        self.peak = PeakSources.of(projections)
         self._original_media = media.original()
         self.peak_distance = dr.opaque(mi.Float, PEAK_DISTANCE)
         self._view_extent = mi.Float(0), mi.Float(0)
@@ -139,9 +139,9 @@ class SurfacePaths:
         return SpacingBounds(dr.maximum(coarsest, COARSEST_FROM_NODES * travelled), finest)
 
     @property
-    def narrow_sources(self) -> tuple[Source, ...]:
+    def narrow_sources(self) -> SourceTable:
         """Narrow sources whose radiance truncated forward peaks scatter, empty without a peak."""
-        return () if self.narrow is None else (*self.narrow.sources, *self.narrow.others)
+        return SourceTable([]) if self.peak is None else self.peak.narrow
 
     @symbolic
     def follow(
@@ -177,7 +177,7 @@ class SurfacePaths:
 
         ``sample`` chooses positions on the emitters. ``where`` are two masks: where the path ends,
         so that a ray is sampled from the BSDF here for multiple importance sampling; and where
-        narrow sources are attenuated by the original extinction, see `_media_towards`. The
+        emitters that forward peaks scatter are attenuated by the original extinction. The
         transmittance has no noise if it is to be ``exact``.
         """
         ends, is_original = where
@@ -191,7 +191,7 @@ class SurfacePaths:
             reflects = active & (record.pdf > 0) & (dr.max(value) > 0)
             behind = medium_after(si, record.d, pointer)
             far = are_distant(record.emitter)
-            media = self._media_towards(vertex.p, record.d, far, ~far, is_original)
+            media = self._media_towards(record, vertex.p, is_original & far, is_original & ~far)
             target = position_on(record, vertex)
             passed, rng = visibility(scene, media, vertex, target, behind, rng, reflects, exact)
             weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
@@ -204,24 +204,18 @@ class SurfacePaths:
         return result, rng
 
     def _media_towards(
-        self,
-        p: mi.Point3f,
-        direction: mi.Vector3f,
-        far: mi.Bool,
-        near: mi.Bool,
-        is_original: mi.Bool,
+        self, record: mi.DirectionSample3f, p: mi.Point3f, far: mi.Bool, near: mi.Bool
     ) -> Media | PartlyOriginalMedia:
-        """Return the media by which emitters in a ``direction`` from ``p`` are attenuated.
+        """Return the media by which sampled emitters are attenuated as seen from ``p``.
 
-        In the lanes ``is_original``, narrow sources are attenuated by the original extinction:
-        their radiance that is scattered into a truncated forward peak is part of the radiance that
-        nodes gather, or that is scattered towards ``p``. ``far`` and ``near`` are as in
-        `AngularBasis.hits_source`.
+        In the lanes ``far`` (`AngularBasis.hits_source`) and ``near``, emitters that forward peaks
+        scatter are attenuated by the original extinction: the rest of their radiance is part of the
+        radiance that nodes gather, or that is scattered towards ``p``.
         """
-        if self.narrow is None:
+        if self.peak is None:
             return self.media
-        narrow = is_original & self.narrow.hits_source(p, direction, far, near)
-        return PartlyOriginalMedia(self.media, self._original_media, narrow)
+        is_original = self.peak.include(record.emitter, p, record.d, far, near)
+        return PartlyOriginalMedia(self.media, self._original_media, is_original)
 
     def met_by_bsdf(self, scene, si, pointer, rng, active, exact: bool):
         """Sample a ray from the BSDF at ``si``; return the reflected radiance of the sampled
@@ -233,9 +227,10 @@ class SurfacePaths:
         active = active & (sample.pdf > 0) & (dr.max(f) > 0)
         direction, vertex = si.to_world(sample.wo), vertex_at(si)
         pointer = medium_after(si, direction, pointer)
-        everywhere = mi.Bool(True)
-        media = self._media_towards(vertex.p, direction, everywhere, everywhere, everywhere)
-        ray = si.spawn_ray(direction)
+        ray, media = si.spawn_ray(direction), self.media
+        if self.peak is not None:
+            is_original = self.peak.hit_by(scene, vertex.p, ray, active, active)
+            media = PartlyOriginalMedia(media, self._original_media, is_original)
         lines = ray, pointer, active
         met, rng = self._emitters_along(scene, media, lines, vertex, sample.pdf, rng, exact)
         return f * met, rng
@@ -351,7 +346,9 @@ class SurfacePaths:
             for projection in self.projections:
                 inside = active & (bounces == 0) & (pointer == projection.medium.pointer)
                 distance = dr.maximum(travelled, projection.cell * MEDIUM_CELLS)
-                if dr.hint(projection.truncates_peak and self.narrow_sources, mode="scalar"):
+                if dr.hint(
+                    projection.truncates_peak and self.narrow_sources.count > 0, mode="scalar"
+                ):
                     distance *= self.peak_distance
                 nearest = dr.select(inside, dr.minimum(nearest, distance), nearest)
             si = scene.ray_intersect(ray, active)
@@ -541,12 +538,11 @@ class _PathFollower:
         value = emitter.eval(si, is_emitter)
         excess = paths.emitters.excess(emitter, value)
         value *= path.throughput
-        if paths.narrow is not None:
-            narrow = paths.narrow.hits_source(
-                path.last.p, path.ray.d, is_emitter & ~valid, is_emitter & valid
-            )
-            narrow &= path.first | (not self._from_node)
-            value *= dr.select(narrow, path.share, 1)
+        if paths.peak is not None:
+            ends = is_emitter & ~valid, is_emitter & valid
+            unblurred = paths.peak.include(emitter, path.last.p, path.ray.d, *ends)
+            unblurred &= path.first | (not self._from_node)
+            value *= dr.select(unblurred, path.share, 1)
         record = mi.DirectionSample3f(self._scene, si, path.last)
         sampled = is_emitter & (path.pdf > 0) & (excess > 0)
         density = emitter.pdf_direction(path.last, record, sampled)

@@ -374,10 +374,17 @@ SURFACES = (
     ),
     Mutant(
         "forward peaks scatter radiance of wide emitters twice",
-        "render/camera.py",
-        "return narrow | self._is_direct(emitter_behind(scene, ray, active), active)",
-        "return narrow",
+        "render/peak_sources.py",
+        "found |= near & (emitter == own)",
+        "pass",
         (PHASE,),
+    ),
+    Mutant(
+        "what forward peaks scatter of several sources counts several times",
+        "render/surface_irradiance.py",
+        "return total / mi.Float(count)",
+        "return total / (mi.Float(count) * mi.Float(count))",
+        ("tests/system/test_forward_peaks.py",),
     ),
     Mutant(
         "no more samples where few paths meet a lamp",
