@@ -59,6 +59,9 @@ SURFACE_MARGIN = 0.01
 #: Maximum optical depth per step of the packed extinction: the 16-bit format has a limited range,
 #: which larger values would waste.
 OPAQUE = 4096.0
+#: Number of direct lights from which on the march calls a function in the kernel for each, instead
+#: of containing the code for each.
+MANY_LIGHTS = 3
 
 
 class MarchedPart:
@@ -433,7 +436,7 @@ class _MarchState:
     1, ``stride`` the number of steps from it to the next one, ``t`` the distance of the
     last one and ``here`` the fields there. ``previous`` and ``previous_length`` belong to the
     segment before. ``peak`` is that of `Projection.fetch`, and ``means`` are the mean extinctions
-    towards the direct lights.
+    towards the direct lights, empty for many lights.
     """
 
     k: mi.Float
@@ -503,6 +506,8 @@ class _RayMarch:
         here = _FieldSample(*projection.zero_sample())
         grey = projection.medium.sigma_t.channels == 1
         lights = projection.direct_lights
+        if len(lights) >= MANY_LIGHTS:
+            lights = []
         return _MarchState(
             k=mi.Float(0),
             stride=mi.Float(1),
@@ -644,15 +649,31 @@ class _RayMarch:
             return
         albedo = projection.medium.albedo
         albedos = tuple(mi.Spectrum(albedo.at_world(ray(t))) for t in (state.t, end))
+        peak_depth = [0.5 * (state.peak[0] + peak[0])] if state.peak else []
+        ends = state.t, end
+        if not state.means:
+            calls = [self._call(light) for light in projection.direct_lights]
+            values = ray, ends, part.extinctions, part.weights, albedos, peak_depth
+            state.radiance += state.transmittance * _sum_of_calls(calls, values)
+            return
         for i, light in enumerate(projection.direct_lights):
             skipped = light.mean_extinction(ray(state.t), part.skip)
             mean = dr.select(part.skip, skipped, state.means[i])
             state.means[i] = light.mean_extinction(ray(end), state.active)
-            peak_depth = 0.5 * (state.peak[0] + peak[0]) if state.peak else None
-            ends, means = (state.t, end), (mean, state.means[i])
+            means = mean, state.means[i]
             lit = RaySegment(ray, ends, part.extinctions, means, part.weights, albedos)
-            scattered = light.scattered(lit, self._scattering, peak_depth)
+            scattered = light.scattered(lit, self._scattering, *peak_depth)
             state.radiance += state.transmittance * scattered
+
+    def _call(self, light: DirectLightAlongRays) -> Callable:
+        """Return a function of the values of a segment: the radiance that ``light`` adds."""
+
+        def scattered(ray, ends, extinctions, weights, albedos, peak_depth):
+            means = tuple(light.mean_extinction(ray(t), mi.Bool(True)) for t in ends)
+            lit = RaySegment(ray, ends, extinctions, means, weights, albedos)
+            return light.scattered(lit, self._scattering, *peak_depth)
+
+        return scattered
 
     def _add_emitted(self, state: _MarchState, part: _MarchedSegment, length: mi.Float) -> None:
         emission = self._projection.medium.emission
@@ -685,6 +706,18 @@ class _RayMarch:
                 first = dr.floor((first - dr.floor(first)) * stride) + 1
                 stride = dr.select(state.k == 0, first, stride)
             state.stride = stride
+
+
+@symbolic
+def _sum_of_calls(calls: Sequence[Callable], values: tuple):
+    """Sum the spectra that functions of ``values`` return, by calls in the kernel: it contains code
+    that several of them share once.
+    """
+    total, i, count = mi.Spectrum(0), mi.UInt32(0), dr.opaque(mi.UInt32, len(calls))
+    while dr.hint(i < count, label="calls"):
+        total += dr.switch(i, calls, *values)
+        i += 1
+    return total
 
 
 def _simplified(field: Field) -> Field:
