@@ -285,12 +285,15 @@ class CachedMedium:
             return
         self._has_known_noise = True
         if self._direction_noise > LARGE_DIRECTION_NOISE:
+            # The solver "path" refuses sharp phase functions.
+            sharp = self.cache.directional is not None and self.medium.original is not None
+            other = "render with volpath" if sharp else "set solver to path"
             mi.Log(
                 mi.LogLevel.Warn,
                 f"irrcache: {self.label}the irradiance has a noise of about "
                 f"{100 * self._direction_noise:.1f} % that neighbouring voxels share, because few "
                 "directions meet what emits: errors of several percent are expected in parts of "
-                f"the image. Raise cache_spp (now {self.cache.samples}), or set solver to path.",
+                f"the image. Raise cache_spp (now {self.cache.samples}), or {other}.",
             )
         if not self.cache.has_own_errors:
             return

@@ -365,7 +365,7 @@ MUTANTS = (
     Mutant(
         "directions are not rotated",
         "solvers/discrete_ordinates/angular_quadrature.py",
-        "points = points @ _rotation(rng).T",
+        "points = points @ rotation.T",
         "points = points",
         ("tests/unit/solvers/discrete_ordinates/test_angular_quadrature.py",),
     ),

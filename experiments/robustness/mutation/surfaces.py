@@ -380,6 +380,13 @@ SURFACES = (
         (PHASE,),
     ),
     Mutant(
+        "ordinates are not arranged around suns",
+        "solvers/discrete_ordinates/incident.py",
+        "if self._is_isotropic or not self._suns:",
+        "if True:",
+        ("tests/system/test_forward_peaks.py",),
+    ),
+    Mutant(
         "what forward peaks scatter of several sources counts several times",
         "render/surface_irradiance.py",
         "return total / mi.Float(count)",

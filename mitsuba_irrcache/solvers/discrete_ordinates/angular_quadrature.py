@@ -7,6 +7,11 @@ opposite ordinates, of degree 3. In the diffusive interior of dense media radian
 degrees, so it is integrated exactly for any rotation. (If a weight would be below a quarter of the
 mean, as in some sets of few pairs, all weights are equal.)
 
+If a sun illuminates a medium that scatters anisotropically, the axis of the spiral points roughly
+towards it: radiance that is scattered a few times varies mainly with the angle from that axis, and
+the spiral is a midpoint rule in its cosine. Under a sun, the mean of an image of an isolated cloud
+with g = 0.85, seen from the side, had errors of up to -7 % by seed with other rotations, now 2 %.
+
 The sets of several passes are parts of one larger spiral. Each set is evenly distributed, and so is
 their union; independent rotations would have three times the noise.
 """
@@ -58,19 +63,25 @@ def merged(sets: list[Ordinates]) -> Ordinates:
     return Ordinates(*(np.concatenate(parts) for parts in zip(*sets, strict=True)))
 
 
-def hemisphere_ordinates(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def hemisphere_ordinates(
+    count: int, rng: np.random.Generator, axis: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return ``count`` directions (n, 3), one of each pair, and the weights (n) [sr] of each of
-    them and each of their opposites.
+    them and each of their opposites. ``axis`` is that of the spiral, about; None: a random one.
     """
-    return joint_ordinates(1, count, rng)[0]
+    return joint_ordinates(1, count, rng, axis)[0]
 
 
 def joint_ordinates(
-    sets: int, count: int, rng: np.random.Generator
+    sets: int, count: int, rng: np.random.Generator, axis: np.ndarray | None = None
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return ``sets`` results of `hemisphere_ordinates` whose union is evenly distributed, too."""
     points, members = _divided_spiral(sets, count)
-    points = points @ _rotation(rng).T
+    if axis is None:
+        rotation = _rotation(rng)
+    else:
+        rotation = _rotation_about(axis, np.sqrt(2 / len(points)), rng)
+    points = points @ rotation.T
     return [(points[own], _weights(points[own])) for own in members]
 
 
@@ -135,3 +146,18 @@ def _rotation(rng: np.random.Generator) -> np.ndarray:
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.linalg.det(q)
+
+
+def _rotation_about(axis: np.ndarray, tilt: float, rng: np.random.Generator) -> np.ndarray:
+    """Return a rotation matrix (3, 3) of the z axis to about ``axis``, by a random angle around it.
+
+    The sine of the angle from ``axis`` is up to ``tilt``, so that no ordinate has a fixed angle.
+    """
+    across = _rotation(rng)[:, 0]
+    across = np.cross(axis, across)
+    across /= np.linalg.norm(across)
+    sine = tilt * np.sqrt(rng.random())
+    z = np.sqrt(1 - sine * sine) * axis + sine * across
+    x = np.cross(z, _rotation(rng)[:, 0])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)

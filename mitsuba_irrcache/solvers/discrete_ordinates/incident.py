@@ -178,7 +178,7 @@ class DistantIllumination:
         """Return the directions of the even ordinates of each pass, their weights for the radiance
         of voxels, which is 0 for the further ones, and those for the environment.
         """
-        sets = [(*own, own[1]) for own in joint_ordinates(passes, pairs, rng)]
+        sets = [(*own, own[1]) for own in joint_ordinates(passes, pairs, rng, self.axis)]
         if not self._further:
             return sets
         share, more = 1 / (1 + self._further), []
@@ -191,6 +191,16 @@ class DistantIllumination:
             )
             more.append(tuple(np.concatenate(part) for part in parts))
         return more
+
+    @property
+    def axis(self) -> np.ndarray | None:
+        """Direction (3) of the brightest sun, around which ordinates of a medium that scatters
+        anisotropically are arranged; None without suns.
+        """
+        if self._is_isotropic or not self._suns:
+            return None
+        direction, _ = max(self._suns, key=lambda sun: sun[1].sum())
+        return direction
 
     @property
     def sun_count(self) -> int:
