@@ -7,7 +7,7 @@ opposite ordinates, of degree 3. In the diffusive interior of dense media radian
 degrees, so it is integrated exactly for any rotation. (If a weight would be below a quarter of the
 mean, as in some sets of few pairs, all weights are equal.)
 
-If a sun illuminates a medium that scatters anisotropically, the axis of the spiral points roughly
+If a sun illuminates a medium that scatters anisotropically, the axis of the spiral points nearly
 towards it: radiance that is scattered a few times varies mainly with the angle from that axis, and
 the spiral is a midpoint rule in its cosine. Under a sun, the mean of an image of an isolated cloud
 with g = 0.85, seen from the side, had errors of up to -7 % by seed with other rotations, now 2 %.
@@ -30,6 +30,10 @@ from mitsuba_irrcache.core.sequences import GENERALISED_GOLDEN_RATIOS, fibonacci
 #: Weights of the squared integration errors of spherical harmonics, by degree, which are minimised
 #: when the points of a spiral are divided among several sets.
 DEGREES = {2: 4.0, 4: 2.0, 6: 0.5, 8: 0.2}
+#: Largest angle between the axis of a spiral and the direction of a sun, over the radius of a
+#: circle with the solid angle of one ordinate. Reflection by a slab with g = 0.75 below a sun at the
+#: zenith has a noise of 0.25 % with 0 and 0.3, 0.5 % with 1, and 0.8 % with random rotations.
+TILT = 0.3
 #: Rounds of exchange between sets, at most; few are needed.
 ROUNDS = 8
 
@@ -80,7 +84,7 @@ def joint_ordinates(
     if axis is None:
         rotation = _rotation(rng)
     else:
-        rotation = _rotation_about(axis, np.sqrt(2 / len(points)), rng)
+        rotation = _rotation_about(axis, TILT * np.sqrt(2 / len(points)), rng)
     points = points @ rotation.T
     return [(points[own], _weights(points[own])) for own in members]
 
