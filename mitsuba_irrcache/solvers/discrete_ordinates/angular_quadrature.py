@@ -31,8 +31,9 @@ from mitsuba_irrcache.core.sequences import GENERALISED_GOLDEN_RATIOS, fibonacci
 #: when the points of a spiral are divided among several sets.
 DEGREES = {2: 4.0, 4: 2.0, 6: 0.5, 8: 0.2}
 #: Largest angle between the axis of a spiral and the direction of a sun, over the radius of a
-#: circle with the solid angle of one ordinate. Reflection by a slab with g = 0.75 below a sun at the
-#: zenith has a noise of 0.25 % with 0 and 0.3, 0.5 % with 1, and 0.8 % with random rotations.
+#: circle with the solid angle of one ordinate. Reflection by a thin slab with g = 0.75 below a sun
+#: at the zenith has a noise of 0.3 % with 0 and 0.3, 0.5 % with 1, and 0.8 % with random rotations;
+#: by a slab of 8 mean free paths, 0.3 % with 0 to 1, and 0.1 % with random rotations.
 TILT = 0.3
 #: Rounds of exchange between sets, at most; few are needed.
 ROUNDS = 8
