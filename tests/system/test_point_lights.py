@@ -8,6 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.render import raymarch
+
 pytestmark = pytest.mark.usefixtures("mono")
 
 SIGMA_T, ALBEDO, SIZE = 1.0, 0.9, 32
@@ -159,3 +161,34 @@ def test_beside_a_spot_light(scenes):
     (ours, theirs), errors = np.mean(means, axis=1), np.std(means, axis=1, ddof=1) / 3**0.5
     assert errors[1] < 0.003 * theirs, "too noisy to say"
     assert abs(ours - theirs) < 0.005 * theirs + 3 * errors.max()
+
+
+@pytest.mark.parametrize("g", [0.0, 0.5])
+def test_many_lights(monkeypatch, g):
+    """Lights that the ray march evaluates by function calls add the same radiance as others."""
+    dense = {"type": "homogeneous", "sigma_t": 12.0, "albedo": ALBEDO}
+    dense["phase"] = {"type": "hg", "g": g} if g else {"type": "isotropic"}
+    places = [(2.0, 1.5, 0.3), (-1.6, 1.8, 1.0), (0.2, -2.0, 1.7), (0.4, 0.3, 2.5)]
+    colours = np.linspace(0.5, 1.5, len(places))
+    lights = {
+        f"light {k}": point(place) | {"intensity": float(colour)}
+        for k, (place, colour) in enumerate(zip(places, colours, strict=True))
+    }
+    sensor = {
+        "type": "perspective",
+        "to_world": mi.ScalarTransform4f().look_at([1.0, 2.0, 5.0], [0, 0, 0], [0, 1, 0]),
+        "fov": 30.0,
+        "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
+    }
+    cube = {"type": "cube", "bsdf": {"type": "null"}, "interior": dense}
+    images = []
+    for many in (len(places), len(places) + 1):
+        monkeypatch.setattr(raymarch, "MANY_LIGHTS", many)
+        integrator = {"type": "irrcache", "resolution": 8, "cache_spp": 64}
+        scene = mi.load_dict(
+            {"type": "scene", "integrator": integrator, "sensor": sensor, "cube": cube} | lights
+        )
+        images.append(np.array(mi.render(scene, spp=16)))
+        assert len(scene.integrator().cache.direct_lights) == len(places)
+    assert images[0].mean() > 0
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-6)
