@@ -1,8 +1,8 @@
 """Emitters whose radiance truncated forward peaks scatter into camera rays (see `media/delta_m`).
 
 These are the narrow sources, and the area emitters whose irradiance camera rays evaluate
-(`cache/area_light`). What is seen of them directly is attenuated by the original extinction,
-because the rest is part of the scattered radiance.
+(`cache/area_light`). Their radiance along a ray that hits them is attenuated by the original
+extinction: what the peak scatters of it is part of the in-scattered radiance.
 """
 
 from __future__ import annotations
