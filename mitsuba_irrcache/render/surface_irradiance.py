@@ -262,7 +262,8 @@ class SurfaceIrradiance:
             parts = [dr.block_sum(c, rays // PARTS) for c in list(radiance)]
             own = [dr.block_sum(c, PARTS) for c in parts]
             place = p, normals, medium, distance
-            parts_around = min(self.paths.narrow_sources.count, MOST_AROUND)
+            peak = self.paths.peak
+            parts_around = 0 if peak is None else min(peak.narrow.count, MOST_AROUND)
             for number in range(parts_around):
                 around = self._gather_around(scene, numbers, place, number, parts_around)
                 own = [a + b for a, b in zip(own, around, strict=True)]
@@ -283,7 +284,7 @@ class SurfaceIrradiance:
         """
         # docs/primer, eq. (5.12)
         p, (geometric, shading), medium, distance = place
-        sources = self.paths.narrow_sources
+        sources = self.paths.peak.narrow
         lane, k = Divisor(AROUND_SOURCES).split(
             dr.arange(mi.UInt32, dr.width(numbers) * AROUND_SOURCES)
         )

@@ -23,7 +23,6 @@ from mitsuba_irrcache.cache.angular import Scattering
 from mitsuba_irrcache.cache.surface import SpacingBounds, SurfaceNodes
 from mitsuba_irrcache.core.jit import opaque_point, symbolic
 from mitsuba_irrcache.lights.emitters import are_distant
-from mitsuba_irrcache.lights.narrow_sources import SourceTable
 from mitsuba_irrcache.render.film import ViewExtent
 from mitsuba_irrcache.render.path_splitting import no_waiting, resumed, split
 from mitsuba_irrcache.render.peak_sources import PeakSources
@@ -137,11 +136,6 @@ class SurfacePaths:
         coarsest = dr.fma(per_distance, distance, at_sensor)
         finest = dr.maximum(coarsest * self._finest_from_nodes, FINEST_FROM_NODES * travelled)
         return SpacingBounds(dr.maximum(coarsest, COARSEST_FROM_NODES * travelled), finest)
-
-    @property
-    def narrow_sources(self) -> SourceTable:
-        """Narrow sources whose radiance truncated forward peaks scatter, empty without a peak."""
-        return SourceTable([]) if self.peak is None else self.peak.narrow
 
     @symbolic
     def follow(
@@ -346,9 +340,8 @@ class SurfacePaths:
             for projection in self.projections:
                 inside = active & (bounces == 0) & (pointer == projection.medium.pointer)
                 distance = dr.maximum(travelled, projection.cell * MEDIUM_CELLS)
-                if dr.hint(
-                    projection.truncates_peak and self.narrow_sources.count > 0, mode="scalar"
-                ):
+                peaked = projection.truncates_peak and self.peak.narrow.count > 0
+                if dr.hint(peaked, mode="scalar"):
                     distance *= self.peak_distance
                 nearest = dr.select(inside, dr.minimum(nearest, distance), nearest)
             si = scene.ray_intersect(ray, active)
