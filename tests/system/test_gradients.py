@@ -453,6 +453,24 @@ def test_inaccurate_derivatives_at_dense_boundaries_are_warned_of(
     assert len(warnings) == expected
 
 
+@pytest.mark.parametrize("size", [4.0, None])
+def test_wide_emitters_beside_a_forward_peak_are_warned_of(rgb, scenes, logged, size):
+    """Derivatives neglect that the peak scatters their radiance several times, in all pixels."""
+    medium = scenes.medium(1.0, 0.9) | {"phase": {"type": "hg", "g": 0.7}}
+    emitter = scenes.sun
+    if size is not None:
+        above = mi.ScalarTransform4f().look_at([0, 3, 0], [0, 0, 0], [0, 0, 1]).scale(size)
+        area = {"type": "area", "radiance": 1.0}
+        emitter = {"type": "rectangle", "to_world": above, "emitter": area}
+    integrator = {"type": "irrcache", "solver": "sweep", "resolution": 8}
+    scene = scenes.load(integrator, scenes.boundary(medium), 4, emitter=emitter)
+    params = mi.traverse(scene)
+    attached(params, first_key(params, "sigma_t"))
+    dr.backward(loss_of(mi.render(scene, params, spp=4)))
+    (warning,) = [text for text in logged if "scatters sharply: gradients count" in text]
+    assert ("Area emitters" in warning) == (size is not None)
+
+
 def test_images_with_gradients_do_not_keep_the_scene(rgb):
     scene, params, key = small()
     attached(params, key)
