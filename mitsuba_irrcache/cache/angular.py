@@ -220,7 +220,7 @@ class AngularBasis:
         """
         result, attenuation, ratio = mi.Float(0), mi.Float(1), mi.Float(1)
         blur = dr.exp(-0.5 * variance)
-        for legendre, (own, rest) in zip(_legendre(cosine), self._terms, strict=False):
+        for legendre, (own, rest) in zip(legendre_polynomials(cosine), self._terms, strict=False):
             result += (own if whole else rest) * attenuation * legendre
             gain = gain - own * legendre
             ratio *= blur
@@ -229,11 +229,11 @@ class AngularBasis:
 
     def _smooth(self, cosine: mi.Float) -> mi.Float:
         """Evaluate the part of 4 pi p - 1 that the moments represent."""
-        polynomials = islice(_legendre(cosine), 1, None)
+        polynomials = islice(legendre_polynomials(cosine), 1, None)
         return sum(m * p for m, p in zip(self._degrees, polynomials, strict=False))
 
 
-def _legendre(cosine: mi.Float) -> Iterator[mi.Float]:
+def legendre_polynomials(cosine: mi.Float) -> Iterator[mi.Float]:
     """Generate the Legendre polynomials from degree 0 on."""
     before, here = mi.Float(0), mi.Float(1)
     for degree in count():

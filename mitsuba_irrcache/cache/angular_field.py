@@ -79,12 +79,14 @@ class AngularField:
         active: mi.Bool,
         with_peak: bool = True,
         peak_depth: mi.Float | mi.Color3f | None = None,
+        excluded: list[mi.Float] | None = None,
     ) -> mi.Float | mi.Color3f:
         """Evaluate f at ``p`` for a ray along ``direction``.
 
         ``basis`` is the result of `AngularBasis.basis`; ``with_peak`` as in `AngularBasis.gains`.
         ``peak_depth`` is the optical depth of scattering into the forward peak between ``p`` and
-        the camera; None: multiple scattering into the peak is not corrected.
+        the camera; None: multiple scattering into the peak is not corrected. ``excluded`` are
+        weights of the narrow sources to subtract; f may then be negative.
         """
         directional = self.directional
         rows = self._interpolated(self.grid.coordinates.point(p), active)
@@ -99,7 +101,11 @@ class AngularField:
             narrow = moments[len(basis) :]
             extra += sum(w * m for w, m in zip(correction, narrow, strict=False))
             # A truncated series may be negative, and noisy moments are unbounded.
-            found.append(dr.clip(1 + _ratio(extra, phi), 0, directional.largest_ratio))
+            f = dr.clip(1 + _ratio(extra, phi), 0, directional.largest_ratio)
+            if excluded is not None:
+                removed = sum(w * m for w, m in zip(excluded, narrow, strict=True))
+                f -= _ratio(removed, phi)
+            found.append(f)
         return found[0] if self.channels == 1 else mi.Color3f(found)
 
     def sampled_factor(

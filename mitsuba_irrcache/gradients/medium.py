@@ -471,21 +471,12 @@ def warn_of_aureole(part: CachedMedium) -> None:
     cache = part.cache
     if part.medium.original is None or cache is None or cache.directional is None:
         return
-    if not cache.directional.sources and not cache.direct_lights:
+    narrow = any(source.sharp for source in cache.directional.sources)
+    if not narrow and all(isinstance(light, AreaLight) for light in cache.direct_lights):
         return
-    where = (
-        "In pixels within about 10 degrees of a sun, point or lamp behind the medium they are "
-        "wrong by up to a half."
-    )
-    if any(isinstance(light, AreaLight) for light in cache.direct_lights):
-        where += (
-            " Area emitters that appear large from the medium affect all pixels: derivatives with "
-            "respect to the mean cosine g can be wrong by a factor of 2 in total, those with "
-            "respect to extinction and albedo by 10 %. Compare them with differences of images "
-            "before relying on them."
-        )
     mi.Log(
         mi.LogLevel.Warn,
         f'irrcache: medium "{part.medium.name}" scatters sharply: gradients count several '
-        f"scattering events into its forward peak as single ones. {where}",
+        "scattering events into its forward peak as single ones. In pixels within about 10 degrees "
+        "of a sun or point behind the medium they are wrong by up to a half.",
     )

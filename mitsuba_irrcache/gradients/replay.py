@@ -30,6 +30,7 @@ from mitsuba_irrcache.gradients.splatting import (
     summed_to_channels,
 )
 from mitsuba_irrcache.gradients.tangent_fields import CameraReaders
+from mitsuba_irrcache.gradients.visible_lamps import unscattered_weights
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -124,7 +125,14 @@ class InScattering:
         direction, basis, _ = view
         if self._indirect:
             return self._field.sampled_factor(p, direction, basis, active)
-        return self._field.factor(p, direction, basis, active)
+        excluded = self._excluded(p, direction)
+        return self._field.factor(p, direction, basis, active, excluded=excluded)
+
+    def _excluded(self, p: mi.Point3f, direction: mi.Vector3f) -> list[mi.Float] | None:
+        """Return the weights of narrow sources that count as unscattered, see `visible_lamps`."""
+        if self._indirect:
+            return None
+        return unscattered_weights(self._field.directional, p, direction)
 
     def importance(self, p: mi.Point3f, view: tuple, active: mi.Bool) -> list[mi.Float]:
         """Return the components of the importance of rays at ``p``.
@@ -135,6 +143,9 @@ class InScattering:
         # docs/primer, eq. (8.12)
         direction, _, moments = view
         gains = [1 + g for g in self._basis.gains(p, direction, active, not self._indirect)]
+        excluded = self._excluded(p, direction)
+        if excluded is not None:
+            gains = [g - own for g, own in zip(gains, excluded, strict=True)]
         return [mi.Float(1), *moments, *gains]
 
 

@@ -296,6 +296,15 @@ def lamp() -> dict:
     return {"lamp": {"type": "rectangle", "to_world": place, "emitter": light}}
 
 
+def panel(edge: float, distance: float = 2.5) -> dict:
+    """A square lamp behind the medium, as seen by the camera."""
+    camera = np.array(Case.origin)
+    place = -distance / np.linalg.norm(camera) * camera
+    place = mi.ScalarTransform4f().look_at([*place], [0, 0, 0], [0, 1, 0]).scale(edge / 2)
+    light = {"type": "area", "radiance": {"type": "rgb", "value": [1.0, 0.8, 0.6]}}
+    return {"panel": {"type": "rectangle", "to_world": place, "emitter": light}}
+
+
 def second_medium(away: float, g: float | None = None) -> dict:
     """A homogeneous cube beside the medium, at a distance."""
     place = mi.ScalarTransform4f().translate([-2.0 - away, 0, 0])
@@ -400,6 +409,11 @@ def surrounded() -> dict[str, Case]:
         "hg 0.82, ground, sky": Case(g=0.823, objects=ground, **by_g),
         "hg 0.65, two media, sun": Case(
             g=0.65, emitters=_under(sun=SUN), objects=lambda: second_medium(0.5, g=-0.4), **by_g
+        ),
+        "hg 0.7, panel behind": Case(g=0.7, emitters=dict, objects=lambda: panel(2.0)),
+        "hg 0.7, wide panel behind": Case(g=0.7, emitters=dict, objects=lambda: panel(8.0)),
+        "hg 0.7, wide panel behind, by g": Case(
+            g=0.7, emitters=dict, objects=lambda: panel(8.0), **by_g
         ),
         "hg 0.85, ground, sky": Case(g=0.85, objects=ground),
         "hg 0.85, ground, sun": Case(g=0.85, emitters=_under(sun=SUN), objects=ground),
