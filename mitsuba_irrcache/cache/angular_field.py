@@ -79,14 +79,12 @@ class AngularField:
         active: mi.Bool,
         with_peak: bool = True,
         peak_depth: mi.Float | mi.Color3f | None = None,
-        excluded: list[mi.Float] | None = None,
     ) -> mi.Float | mi.Color3f:
         """Evaluate f at ``p`` for a ray along ``direction``.
 
         ``basis`` is the result of `AngularBasis.basis`; ``with_peak`` as in `AngularBasis.gains`.
         ``peak_depth`` is the optical depth of scattering into the forward peak between ``p`` and
-        the camera; None: multiple scattering into the peak is not corrected. ``excluded`` are
-        weights of the narrow sources to subtract; f may then be negative.
+        the camera; None: multiple scattering into the peak is not corrected.
         """
         directional = self.directional
         rows = self._interpolated(self.grid.coordinates.point(p), active)
@@ -101,12 +99,38 @@ class AngularField:
             narrow = moments[len(basis) :]
             extra += sum(w * m for w, m in zip(correction, narrow, strict=False))
             # A truncated series may be negative, and noisy moments are unbounded.
-            f = dr.clip(1 + _ratio(extra, phi), 0, directional.largest_ratio)
-            if excluded is not None:
-                removed = sum(w * m for w, m in zip(excluded, narrow, strict=True))
-                f -= _ratio(removed, phi)
-            found.append(f)
+            found.append(dr.clip(1 + _ratio(extra, phi), 0, directional.largest_ratio))
         return found[0] if self.channels == 1 else mi.Color3f(found)
+
+    def factor_and_change(
+        self,
+        p: mi.Point3f,
+        basis: list[mi.Float],
+        active: mi.Bool,
+        narrow: list[list[tuple[mi.Float, mi.Float, mi.Float]]],
+    ) -> tuple[mi.Float | mi.Color3f, mi.Float | mi.Color3f]:
+        """Evaluate f with other weights of the narrow sources, and f plus a change.
+
+        ``narrow`` has, for each channel or for all of them, three weights of each source: one in
+        the place of `AngularBasis.gains`, one to subtract without limits to f, and that of the
+        change.
+        """
+        found = []
+        rows = self._interpolated(self.grid.coordinates.point(p), active)
+        channels = narrow * (self.channels // len(narrow))
+        for (phi, *values), own in zip(rows, channels, strict=True):
+            moments = values[: self._moments]
+            gains, excluded, changes = zip(*own, strict=True) if own else ((), (), ())
+            extra = sum(w * m for w, m in zip([*basis, *gains], moments, strict=True))
+            sources = moments[len(basis) :]
+            f = dr.clip(1 + _ratio(extra, phi), 0, self.directional.largest_ratio)
+            f -= _ratio(sum(w * e for w, e in zip(excluded, sources, strict=True)), phi)
+            change = _ratio(sum(w * e for w, e in zip(changes, sources, strict=True)), phi)
+            found.append((f, f + change))
+        if self.channels == 1:
+            return found[0]
+        values, changed = zip(*found, strict=True)
+        return mi.Color3f(*values), mi.Color3f(*changed)
 
     def sampled_factor(
         self, p: mi.Point3f, direction: mi.Vector3f, basis: list[mi.Float], active: mi.Bool

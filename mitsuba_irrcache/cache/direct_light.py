@@ -430,11 +430,14 @@ class DirectLightAlongRays:
         light: DirectLight,
         basis: AngularBasis | None = None,
         moments: AngularField | None = None,
+        peak_factor: float = 1.0,
     ) -> None:
         """``basis`` is None for isotropic scattering. For anisotropic scattering, ``moments`` are
         those of the radiance from all emitters with extent (see `area_light.moments_of`).
+        ``peak_factor`` multiplies optical depths of the forward peak.
         """
         self.light, self._basis, self._moments = light, basis, moments
+        self._peak_factor = dr.opaque(mi.Float, peak_factor)
 
     def _gain(
         self,
@@ -453,7 +456,7 @@ class DirectLightAlongRays:
             gain = basis.gain(p, direction, light.towards(p), with_peak)
             if peak_depth is None or not basis.phase.forward:
                 return gain
-            depth, cosine = light.peak_depth(p) + peak_depth, dr.dot(direction, light.towards(p))
+            depth, cosine = self._bend(p, direction, peak_depth)
             return maximum(gain + basis.phase.aureole.correction(cosine, depth), 0.0)
         view = direction, basis.basis(direction)
         smooth = self._moments.factor(p, *view, mi.Bool(True), with_peak)
@@ -462,6 +465,40 @@ class DirectLightAlongRays:
         if peak_depth is not None and basis.phase.forward:
             peak_depth = light.peak_depth(p) + peak_depth
         return maximum(smooth + light.mean_residual(basis, p, direction, peak_depth), 0.0)
+
+    def _bend(
+        self, p: mi.Point3f, direction: mi.Vector3f, peak_depth: mi.Float | mi.Color3f
+    ) -> tuple[mi.Float | mi.Color3f, mi.Float]:
+        """Return the optical depth of the forward peak along the path from an emitter without
+        extent via ``p`` to the camera, and the cosine of the angle of scattering.
+        """
+        depth = (self.light.peak_depth(p) + peak_depth) * self._peak_factor
+        return depth, dr.dot(direction, self.light.towards(p))
+
+    def at_with_change(
+        self,
+        p: mi.Point3f,
+        active: mi.Bool,
+        direction: mi.Vector3f | None,
+        peak_depth: mi.Float | mi.Color3f,
+    ) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """Evaluate `at` with the forward peak, for an emitter without extent; and that value plus
+        the derivative of the `aureole.Aureole` correction, see `gradients/source_weights`.
+        """
+        basis = self._basis
+        if basis is None:
+            value = self.at(p, active)
+            return value, value
+        value = self.at(p, active, direction, with_peak=True, peak_depth=peak_depth)
+        if not basis.phase.forward:
+            return value, value
+        depth, cosine = self._bend(p, direction, peak_depth)
+        phase = basis.phase
+        change = phase.aureole_of_changes.correction(cosine, depth)
+        change -= phase.aureole.correction(cosine, depth)
+        light = self.light
+        passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active) * change
+        return value, value + mi.Spectrum(passed) * light.unobstructed(p, active)
 
     def at(
         self,

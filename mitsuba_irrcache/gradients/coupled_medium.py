@@ -30,13 +30,13 @@ from mitsuba_irrcache.gradients.medium import (
     means_over_collisions,
     splat_of,
     sums_for,
-    warn_of_aureole,
 )
 from mitsuba_irrcache.gradients.parameters import ALBEDO, EMISSION, MEAN_COSINE, SIGMA_T
 from mitsuba_irrcache.gradients.phase_function import NeighbouringPhases
 from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, InScattering
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
 from mitsuba_irrcache.gradients.scattering import Components, IsotropicScattering
+from mitsuba_irrcache.gradients.source_weights import SourceDepths, SourceWeights
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, VoxelSums
 from mitsuba_irrcache.gradients.tangent_fields import MediumChanges
 from mitsuba_irrcache.gradients.transport import AdjointTransport, TransportSettings
@@ -71,7 +71,8 @@ def added_components(first: list[Components], second: list[Components]) -> list[
 class KnownFluence:
     """The fluence of a medium on the grid of its cache, see `FluenceAlongRays`.
 
-    ``values`` are the components of each channel; ``basis`` is None for isotropic scattering.
+    ``values`` are the components of each channel; ``basis`` is None for isotropic scattering;
+    ``depths`` are None without a truncated forward peak.
     """
 
     falloff = None
@@ -82,6 +83,7 @@ class KnownFluence:
         values: list[Components],
         border: BorderProfile | None,
         basis: AngularBasis | None,
+        depths: SourceDepths | None,
     ) -> None:
         irradiance = [components[0] for components in values]
         roots = [dr.sqrt(dr.maximum(v, 0)) for v in irradiance]
@@ -91,7 +93,9 @@ class KnownFluence:
         if basis is not None:
             higher = zip(*(components[1:] for components in values), strict=True)
             moments = [layer for channels in higher for layer in channels]
-            self.angular = InScattering(AngularField(basis, grid, irradiance, moments), basis)
+            field = AngularField(basis, grid, irradiance, moments)
+            weights = SourceWeights(basis, depths, visible=True)
+            self.angular = InScattering(field, basis, weights)
         self._basis = basis
 
     def scattered_by(self, phase: Phase) -> KnownFluence:
@@ -192,12 +196,14 @@ class CoupledMedium:
         self.channels = self.transport.channels
         self.extinction = list(found)[: self.channels]
         dr.eval(self.extinction)
+        self._depths: SourceDepths | None = None
+        if part.medium.original is not None:
+            self._depths = SourceDepths(part.medium, self.grid, self.basis.sources)
         # The cached moments exclude what camera rays evaluate in closed form.
         lights = self.cache.direct_lights if self.basis is not None else ()
         known = [(light, sources_of(scene, [light.emitter])[1][0]) for light in lights]
         self.values = [self._cached(known, channel) for channel in range(self.channels)]
         self._update()
-        warn_of_aureole(part)
 
     @property
     def basis(self) -> AngularBasis | None:
@@ -252,7 +258,7 @@ class CoupledMedium:
         self._update()
 
     def _update(self) -> None:
-        fluence = KnownFluence(self.grid, self.values, self.cache.border, self.basis)
+        fluence = KnownFluence(self.grid, self.values, self.cache.border, self.basis, self._depths)
         neighbours = None
         if self._phases is not None:
             marches = [

@@ -15,6 +15,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.gradients.replay import InScattering
 from mitsuba_irrcache.gradients.scattering import Components
+from mitsuba_irrcache.gradients.source_weights import SourceDepths, SourceWeights
 from mitsuba_irrcache.gradients.transport import AdjointTransport
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -72,7 +73,10 @@ class FluenceFields:
             moments = [values for each in zip(*total, strict=True) for values in each][channels:]
             irradiance = [components[0] for components in total]
             field = AngularField(cache.directional, grid, irradiance, moments)
-            self.angular = InScattering(field, transport.scattering.basis)
+            every, depths = transport.scattering.basis, None
+            if medium.original is not None:
+                depths = SourceDepths(medium, grid, every.sources)
+            self.angular = InScattering(field, every, SourceWeights(every, depths))
             basis = AngularBasis(medium.phase, [])
         falloff = InverseSquareFactor.of(scene, grid, [light.emitter for light in lights])
         roots = [dr.sqrt(dr.maximum(components[0], 0)) for components in total]
@@ -96,7 +100,13 @@ class FluenceFields:
         basis = AngularBasis(phase, own.sources, order=own.order)
         fields.angular = self.angular.in_basis(basis)
         basis = AngularBasis(phase, [], order=own.order)
-        fields.direct_lights = [DirectLightAlongRays(light, basis) for light in self._lights]
+        factor = 1.0
+        if phase.forward:
+            ratios = [f / (1 - f) for f in (phase.forward, own.phase.forward)]
+            factor = ratios[0] / ratios[1]
+        fields.direct_lights = [
+            DirectLightAlongRays(light, basis, peak_factor=factor) for light in self._lights
+        ]
         return fields
 
     def _cached(self, channel: int) -> Components:

@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.area_light import AreaLight
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.gradients.border_error import (
@@ -135,7 +134,6 @@ class MediumAdjoint:
             if self.transport.channels == 1:
                 factors = [dr.opaque(mi.Float, float(c)) for c in self.transport.colour]
                 colour = mi.Spectrum(factors)
-        warn_of_aureole(part)
         neighbours = None
         if self.phases is not None:
             phases = self.phases.below, self.phases.above
@@ -464,19 +462,3 @@ def values_per_voxel(cache: IrradianceCache) -> int:
 def _largest(channels: list[mi.Float]) -> float:
     """Return the largest magnitude in all channels; 0 if there are none."""
     return max((float(dr.max(dr.abs(values))[0]) for values in channels), default=0.0)
-
-
-def warn_of_aureole(part: CachedMedium) -> None:
-    """Log a warning if derivatives neglect multiple scattering into a forward peak."""
-    cache = part.cache
-    if part.medium.original is None or cache is None or cache.directional is None:
-        return
-    narrow = any(source.sharp for source in cache.directional.sources)
-    if not narrow and all(isinstance(light, AreaLight) for light in cache.direct_lights):
-        return
-    mi.Log(
-        mi.LogLevel.Warn,
-        f'irrcache: medium "{part.medium.name}" scatters sharply: gradients count several '
-        "scattering events into its forward peak as single ones. In pixels within about 10 degrees "
-        "of a sun or point behind the medium they are wrong by up to a half.",
-    )

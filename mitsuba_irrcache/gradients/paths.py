@@ -148,6 +148,10 @@ class MarchedMedia:
         """
         return MarchedMedia([march.indirect() for march in self.marches])
 
+    def without_visible(self) -> MarchedMedia:
+        """Return the media for rays that do not see emitters, see `visible_sources`."""
+        return MarchedMedia([march.without_visible() for march in self.marches])
+
     def without_scattering(self) -> MarchedMedia:
         """Return the media as they attenuate radiance, without what they scatter."""
         return MarchedMedia([march.without_scattering() for march in self.marches])
@@ -244,6 +248,8 @@ class TracedPaths:
         self._attenuating = None if events is None else media.without_scattering()
         #: the media for rays from voxels and diffuse surfaces
         self._indirect = media.indirect()
+        #: the media for rays of the camera, straight and after reflection or refraction
+        self._straight = media.without_visible() if hide_emitters else media
         self._segments: list[Segment] = []
         self._vertices: list[Vertex | None] = []
 
@@ -272,7 +278,7 @@ class TracedPaths:
             alpha = start.alpha if number == 0 else None
             of_emitters = start.adjoint_of_emitters if number == 0 else None
             weights = weight, weight if of_emitters is None else of_emitters
-            parts = self._parts(number, is_from_camera, is_followed, count)
+            parts = self._parts(number, is_from_camera, (is_seen, is_followed), count)
             skipped, ends = [], mi.Bool(False)
             if number == 0 and is_from_camera:
                 skipped = self._media.unnamed(ray, start.medium)
@@ -295,9 +301,16 @@ class TracedPaths:
         return total
 
     def _parts(
-        self, number: int, is_from_camera: bool, is_followed: mi.Bool, count: mi.UInt32
+        self,
+        number: int,
+        is_from_camera: bool,
+        visible: tuple[mi.Bool, mi.Bool],
+        count: mi.UInt32,
     ) -> list[tuple[list[CameraReplay], mi.Bool]]:
         """Return the marches of a segment, each with the paths for which it is used.
+
+        ``visible`` states which paths the camera sees straight, and which also by reflection and
+        refraction.
 
         Forward peaks scatter radiance of narrow sources into paths that the camera follows by
         reflection and refraction. Media scatter into paths of less than the largest number of
@@ -309,12 +322,16 @@ class TracedPaths:
         if self._media.are_isotropic or not is_from_camera:
             parts = [(self._indirect.marches, scatters)]
         elif number == 0:
-            parts = [(self._media.marches, scatters)]
+            parts = [(self._straight.marches, scatters)]
         else:
+            is_seen, is_followed = visible
             parts = [
                 (self._media.marches, scatters & is_followed),
                 (self._indirect.marches, scatters & ~is_followed),
             ]
+            if self._hides:
+                parts[0] = self._media.marches, scatters & is_followed & ~is_seen
+                parts.insert(0, (self._straight.marches, scatters & is_seen))
         if self._events is not None and number > 0:
             parts.append((self._attenuating.marches, ~scatters))
         return parts

@@ -10,6 +10,7 @@ Jakob 2021), this needs no memory per step.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from typing import NamedTuple, Protocol
 
@@ -23,6 +24,7 @@ from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.core.fast_math import absorptance, minimum
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.gradients.points import add_paths_to_light
+from mitsuba_irrcache.gradients.source_weights import SourceWeights
 from mitsuba_irrcache.gradients.splatting import (
     ConstantSplat,
     GridSplat,
@@ -30,7 +32,6 @@ from mitsuba_irrcache.gradients.splatting import (
     summed_to_channels,
 )
 from mitsuba_irrcache.gradients.tangent_fields import CameraReaders
-from mitsuba_irrcache.gradients.visible_lamps import unscattered_weights
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -96,57 +97,89 @@ class CameraSplats:
         return CameraSplats(self.sigma_t, None, None)
 
 
+class ScatteringAt(NamedTuple):
+    """Anisotropic scattering at a position into a ray.
+
+    Attributes:
+        factor: the factor by which it differs from isotropic scattering.
+        changed: the factor that takes its place in derivatives with respect to the scattering
+            coefficient, see `source_weights`.
+        gains: for each channel, or for all of them, the weight of the irradiance of each source.
+    """
+
+    factor: mi.Float | mi.Color3f
+    changed: mi.Float | mi.Color3f
+    gains: list[list[mi.Float]]
+
+
 class InScattering:
     """Anisotropic scattering into camera rays.
 
-    ``field`` evaluates the factor by which scattering into a direction differs from isotropic
-    scattering; ``basis`` has all narrow sources of the scene. If ``indirect``, the factor is an
-    estimate from one voxel, and a truncated forward peak scatters no radiance of narrow sources.
+    ``field`` has the moments; ``basis`` has all narrow sources of the scene, whose weights are
+    ``weights``. If ``indirect``, the factor is an estimate from one voxel, and a truncated forward
+    peak scatters no radiance of narrow sources.
     """
 
-    def __init__(self, field: AngularField, basis: AngularBasis, indirect: bool = False) -> None:
-        self._field, self._basis, self._indirect = field, basis, indirect
+    def __init__(
+        self,
+        field: AngularField,
+        basis: AngularBasis,
+        weights: SourceWeights,
+        indirect: bool = False,
+    ) -> None:
+        self._field, self._basis = field, basis
+        self._weights, self._indirect = weights, indirect
+        # The field may lack sources whose irradiance is evaluated along rays.
+        self._own = [
+            next(i for i, each in enumerate(basis.sources) if each.is_same(source))
+            for source in field.directional.sources
+        ]
 
     def in_basis(self, basis: AngularBasis) -> InScattering:
         """Return the scattering by another phase function, that of ``basis``."""
-        return InScattering(self._field.in_basis(basis), self._basis, self._indirect)
+        weights = self._weights.scattered_by(basis.phase)
+        return InScattering(self._field.in_basis(basis), self._basis, weights, self._indirect)
 
     def indirect(self) -> InScattering:
         """Return the scattering into rays that the camera does not follow."""
-        return InScattering(self._field, self._basis, indirect=True)
+        return InScattering(self._field, self._basis, self._weights, indirect=True)
+
+    def without_visible(self) -> InScattering:
+        """Return the scattering into rays that do not see narrow sources."""
+        weights = self._weights.without_visible()
+        return InScattering(self._field, self._basis, weights, self._indirect)
 
     def view(self, direction: mi.Vector3f) -> tuple:
         """Evaluate what depends on the ``direction`` of rays only; an argument of other methods."""
         moments = list(dr.sh_eval(-direction, self._basis.order))[1:]
         return direction, self._field.directional.basis(direction), moments
 
-    def factor(self, p: mi.Point3f, view: tuple, active: mi.Bool) -> mi.Float | mi.Color3f:
-        """Return the factor of the irradiance at ``p``, see `AngularField.factor`."""
+    def at(
+        self, p: mi.Point3f, view: tuple, active: mi.Bool, peak_depth: mi.Float | mi.Color3f
+    ) -> ScatteringAt:
+        """Evaluate the scattering at ``p``, where ``peak_depth`` is the optical depth of the
+        forward peak between ``p`` and the camera.
+        """
         direction, basis, _ = view
         if self._indirect:
-            return self._field.sampled_factor(p, direction, basis, active)
-        excluded = self._excluded(p, direction)
-        return self._field.factor(p, direction, basis, active, excluded=excluded)
+            factor = self._field.sampled_factor(p, direction, basis, active)
+            gains = self._basis.gains(p, direction, active, with_peak=False)
+            return ScatteringAt(factor, factor, [gains])
+        weights = self._weights.at(p, direction, active, peak_depth)
+        narrow = [[channel[i] for i in self._own] for channel in weights]
+        values = self._field.factor_and_change(p, basis, active, narrow)
+        gains = [[own.gain - own.excluded for own in channel] for channel in weights]
+        return ScatteringAt(*values, gains)
 
-    def _excluded(self, p: mi.Point3f, direction: mi.Vector3f) -> list[mi.Float] | None:
-        """Return the weights of narrow sources that count as unscattered, see `visible_lamps`."""
-        if self._indirect:
-            return None
-        return unscattered_weights(self._field.directional, p, direction)
-
-    def importance(self, p: mi.Point3f, view: tuple, active: mi.Bool) -> list[mi.Float]:
-        """Return the components of the importance of rays at ``p``.
+    def importance(self, view: tuple, gains: list[mi.Float]) -> list[mi.Float]:
+        """Return the components of the importance of rays, given the weights of narrow sources.
 
         These are the spherical harmonics of their direction, followed by the weight with which the
         irradiance of each narrow source is scattered into it.
         """
         # docs/primer, eq. (8.12)
-        direction, _, moments = view
-        gains = [1 + g for g in self._basis.gains(p, direction, active, not self._indirect)]
-        excluded = self._excluded(p, direction)
-        if excluded is not None:
-            gains = [g - own for g, own in zip(gains, excluded, strict=True)]
-        return [mi.Float(1), *moments, *gains]
+        *_, moments = view
+        return [mi.Float(1), *moments, *(1 + gain for gain in gains)]
 
 
 def _mean_transmittance(tau: mi.Spectrum, absorbed: mi.Spectrum) -> mi.Spectrum:
@@ -211,6 +244,9 @@ class CameraReplay:
         edges = [f.grid.voxel_size.min() for f in fields if f is not None and f.grid is not None]
         length = min(edges, default=float(max(abs(medium.frame[:3, :3]).max(), 1e-30) / 64))
         self.step = dr.opaque(mi.Float, float(length) * step / shorter)
+        #: ratio of the extinction of the truncated forward peak to the scattering coefficient
+        forward = medium.phase.forward
+        self._peak_ratio = dr.opaque(mi.Float, forward / (1 - forward))
         #: step along lines to lights
         self.path_step = dr.opaque(mi.Float, float(length) * step)
 
@@ -223,13 +259,20 @@ class CameraReplay:
 
     def indirect(self) -> CameraReplay:
         """Return the march of rays that the camera does not follow, see `InScattering`."""
+        return self._with_scattering(InScattering.indirect)
+
+    def without_visible(self) -> CameraReplay:
+        """Return the march of rays that do not see narrow sources, see `InScattering`."""
+        return self._with_scattering(InScattering.without_visible)
+
+    def _with_scattering(self, change: Callable[[InScattering], InScattering]) -> CameraReplay:
         if self._angular is None:
             return self
         march = copy(self)
-        march._angular = self._angular.indirect()
+        march._angular = change(self._angular)
         if self._neighbours is not None:
             marches, factor = self._neighbours
-            march._neighbours = [each.indirect() for each in marches], factor
+            march._neighbours = [each._with_scattering(change) for each in marches], factor
         return march
 
     def sigma_t(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
@@ -246,46 +289,75 @@ class CameraReplay:
         """Evaluate what `mean_radiance` needs of the ``direction`` of rays."""
         return () if self._angular is None else self._angular.view(direction)
 
-    def mean_radiance(self, p: mi.Point3f, active: mi.Bool, view: tuple = ()) -> mi.Spectrum:
-        """Return Phi / (4 pi), times the factor of anisotropic scattering into the rays."""
+    def mean_radiance(
+        self, p: mi.Point3f, active: mi.Bool, view: tuple, peak_depth: mi.Float | mi.Color3f
+    ) -> tuple[mi.Spectrum, mi.Spectrum, list[list[mi.Float]]]:
+        """Return Phi / (4 pi), times the factor of anisotropic scattering into the rays; the value
+        that takes its place in derivatives with respect to the scattering coefficient; and the
+        weights of narrow sources, see `ScatteringAt`.
+
+        ``peak_depth`` is the optical depth of the forward peak between ``p`` and the camera.
+        """
         if self.irradiance is None:
-            return mi.Spectrum(0)
-        phi = mi.Spectrum(self.irradiance.at_world(p, active))
-        direction = None
+            return mi.Spectrum(0), mi.Spectrum(0), [[]]
+        phi, gains, direction = mi.Spectrum(self.irradiance.at_world(p, active)), [[]], None
+        changed = mi.Spectrum(phi)
         if self._angular is not None:
             direction = view[0]
-            phi = phi * self._angular.factor(p, view, active)
-        if self.colour is not None:
-            phi = phi * self.colour
+            factor, of_changes, gains = self._angular.at(p, view, active, peak_depth)
+            phi, changed = phi * factor, changed * of_changes
+        scale = mi.Spectrum(1) if self.colour is None else self.colour
         if self._falloff is not None:
-            phi = phi * self._falloff.at(p)
+            scale = scale * self._falloff.at(p)
+        phi, changed = phi * scale, changed * scale
         for light in self.direct_lights:
-            phi = phi + light.at(p, active, direction, with_peak=True)
-        return phi * dr.inv_four_pi
+            own, of_changes = light.at_with_change(p, active, direction, peak_depth)
+            phi, changed = phi + own, changed + of_changes
+        return phi * dr.inv_four_pi, changed * dr.inv_four_pi, gains
+
+    def peak_depth(self, scattering: mi.Spectrum) -> mi.Float | mi.Color3f:
+        """Return the optical depth of the forward peak, given that of ``scattering``."""
+        depth = scattering * self._peak_ratio
+        return depth if self.medium.channels > 1 else depth[0]
 
     def neighbour_views(self, direction: mi.Vector3f) -> list[tuple]:
         """Return `view` of both neighbours."""
         return [] if self._neighbours is None else [m.view(direction) for m in self._neighbours[0]]
 
-    def by_mean_cosine(self, p: mi.Point3f, active: mi.Bool, views: list[tuple]) -> mi.Spectrum:
+    def by_mean_cosine(
+        self,
+        p: mi.Point3f,
+        active: mi.Bool,
+        views: list[tuple],
+        peak_depth: mi.Float | mi.Color3f,
+    ) -> mi.Spectrum:
         """Return the derivative of `mean_radiance` with respect to the mean cosine."""
         if self._neighbours is None:
             return mi.Spectrum(0)
         marches, factor = self._neighbours
         below, above = (
-            march.mean_radiance(p, active, view) for march, view in zip(marches, views, strict=True)
+            march.mean_radiance(p, active, view, peak_depth)[0]
+            for march, view in zip(marches, views, strict=True)
         )
         return (above - below) * factor
 
     def collisions(
-        self, collided: mi.Spectrum, p: mi.Point3f, active: mi.Bool, view: tuple
+        self, collided: mi.Spectrum, view: tuple, gains: list[list[mi.Float]]
     ) -> list[mi.Float]:
-        """Return the components of the importance that collides, channel after channel."""
+        """Return the components of the importance that collides, channel after channel.
+
+        ``gains`` are the weights of narrow sources, see `ScatteringAt`.
+        """
         values = list(collided) if self.colour is None else [dr.sum(collided * self.colour)]
         if self._angular is None:
             return values
-        components = self._angular.importance(p, view, active)
-        return [value * layer for value in values for layer in components]
+        channels = [self._angular.importance(view, own) for own in gains]
+        channels *= len(values) // len(channels)
+        return [
+            value * layer
+            for value, components in zip(values, channels, strict=True)
+            for layer in components
+        ]
 
     def evaluates(self, emitter: mi.Emitter) -> bool:
         """Return whether the irradiance of ``emitter`` is evaluated along rays."""
@@ -341,15 +413,19 @@ class CameraReplay:
         transmittance, active = mi.Spectrum(1), mi.Bool(active) & (near < far)
         view, total = self.view(ray.d), mi.Float(0)
         direction = view[0] if view else None
+        scattering = mi.Spectrum(0)
         places = [mi.Float(near) for _ in targets]
         colours = [mi.Spectrum(dr.zeros(mi.Float, dr.width(near))) for _ in targets]
         while dr.hint(active, label="camera rays"):
             end = minimum(dr.fma(k + offset, self.step, near), far)
             middle = 0.5 * (t + end)
             p = ray(middle)
-            absorbed = absorptance(self.sigma_t(p, active) * (end - t))
-            irradiance = light.at(p, active, direction, with_peak=True)
-            value = passed * absorbed * self.albedo(p, active) * irradiance * dr.inv_four_pi
+            tau, albedo = self.sigma_t(p, active) * (end - t), self.albedo(p, active)
+            absorbed, step = absorptance(tau), albedo * tau
+            depth = self.peak_depth(scattering + 0.5 * step)
+            irradiance, _ = light.at_with_change(p, active, direction, depth)
+            value = passed * absorbed * albedo * irradiance * dr.inv_four_pi
+            scattering += step
             weight = dr.sum(dr.abs(value))
             for number, target in enumerate(targets):
                 # The last step with radiance, if rounding errors leave a target beyond it.
@@ -374,13 +450,16 @@ class CameraReplay:
         view = self.view(ray.d)
         k, t, total = mi.Float(0), mi.Float(near), mi.Spectrum(0)
         transmittance, active = mi.Spectrum(1), mi.Bool(active) & (near < far)
+        scattering = mi.Spectrum(0)
         while dr.hint(active, label="camera rays"):
             end = minimum(dr.fma(k + offset, self.step, near), far)
             p, length = ray(0.5 * (t + end)), end - t
-            tau = self.sigma_t(p, active) * length
-            absorbed = absorptance(tau)
-            source = self.albedo(p, active) * self.mean_radiance(p, active, view)
-            total += transmittance * absorbed * source
+            tau, albedo = self.sigma_t(p, active) * length, self.albedo(p, active)
+            absorbed, step = absorptance(tau), albedo * tau
+            depth = self.peak_depth(scattering + 0.5 * step)
+            mean, _, _ = self.mean_radiance(p, active, view, depth)
+            total += transmittance * absorbed * albedo * mean
+            scattering += step
             if dr.hint(self.medium.emission is not None, mode="scalar"):
                 emitted = self.emitted(p, length, active)
                 total += transmittance * _mean_transmittance(tau, absorbed) * emitted
@@ -425,7 +504,7 @@ class CameraReplay:
         ray, near, far, adjoint, offset, active = segments
         k, t, ahead = mi.Float(0), mi.Float(near), mi.Spectrum(ahead)
         passed, active = mi.Spectrum(adjoint), mi.Bool(active) & (near < far)
-        transmittance, view = mi.Spectrum(1), self.view(ray.d)
+        transmittance, view, scattering = mi.Spectrum(1), self.view(ray.d), mi.Spectrum(0)
         neighbours = (
             self.neighbour_views(ray.d) if dr.hint(splats.g is not None, mode="scalar") else []
         )
@@ -433,8 +512,9 @@ class CameraReplay:
             end = minimum(dr.fma(k + offset, self.step, near), far)
             p, length = ray(0.5 * (t + end)), end - t
             tau = self.sigma_t(p, active) * length
-            absorbed = absorptance(tau)
-            mean, albedo = self.mean_radiance(p, active, view), self.albedo(p, active)
+            absorbed, albedo = absorptance(tau), self.albedo(p, active)
+            depth = self.peak_depth(scattering + 0.5 * albedo * tau)
+            mean, changed, gains = self.mean_radiance(p, active, view, depth)
             ahead -= passed * absorbed * albedo * mean
             share, emitted = mi.Spectrum(1), mi.Spectrum(0)
             if dr.hint(self.medium.emission is not None, mode="scalar"):
@@ -443,26 +523,28 @@ class CameraReplay:
                 ahead -= share * emitted
             following = passed * (1 - absorbed)
             if dr.hint(splats.sigma_t is not None, mode="scalar"):
-                change = length * (following * albedo * mean - ahead)
+                change = length * (following * albedo * changed - ahead)
                 if dr.hint(self.medium.emission is not None, mode="scalar"):
                     change += length * emitted * _derivative_of_mean_transmittance(tau, absorbed)
                 splats.sigma_t.add(p, summed_to_channels(change, splats.sigma_t.channels), active)
             if dr.hint(splats.albedo is not None, mode="scalar"):
-                change = passed * absorbed * mean
+                change = passed * absorbed * changed
                 splats.albedo.add(p, summed_to_channels(change, splats.albedo.channels), active)
             if dr.hint(splats.emission is not None, mode="scalar"):
                 change = summed_to_channels(passed * share * length, splats.emission.channels)
                 splats.emission.add(p, change, active & self.medium.emission.covers(p))
             if dr.hint(splats.collisions is not None, mode="scalar"):
-                values = self.collisions(passed * absorbed, p, active, view)
+                values = self.collisions(passed * absorbed, view, gains)
                 splats.collisions.add(p, values, active)
             if dr.hint(splats.g is not None, mode="scalar"):
-                change = passed * absorbed * albedo * self.by_mean_cosine(p, active, neighbours)
+                change = self.by_mean_cosine(p, active, neighbours, depth)
+                change *= passed * absorbed * albedo
                 splats.g.add(p, summed_to_channels(change, splats.g.channels), active)
             if dr.hint(splats.unscattered is not None, mode="scalar"):
                 change = summed_to_channels(-length * unscattered, splats.unscattered.channels)
                 splats.unscattered.add(p, change, active)
             passed = following
+            scattering += albedo * tau
             transmittance *= 1 - absorbed
             t = end
             k += 1

@@ -14,6 +14,8 @@ moments exp(-D (1 - q_l)) - exp(-D). The TMS correction alone has the moments D 
 function of the peak is replaced by the one with the moments
 
     a_l = [exp(-D (1 - q_l)) - exp(-D)] / D.
+
+The radiance that the peak scatters changes with D by d(D a_l)/dD instead of a_l.
 """
 
 from __future__ import annotations
@@ -36,17 +38,18 @@ class Aureole:
 
     # docs/primer, eq. (5.11)
 
-    def __init__(self, moments: np.ndarray, scale: float) -> None:
+    def __init__(self, moments: np.ndarray, scale: float, of_changes: bool = False) -> None:
         """Tabulate the difference.
 
         ``moments`` are the `PEAK_MOMENTS` Legendre moments q_0 = 1, q_1, ... of the peak, and
-        ``scale`` is f / (1 - f), where f is the share of the peak in the phase function.
+        ``scale`` is f / (1 - f), where f is the share of the peak in the phase function. The
+        difference is that of the derivatives with respect to D if ``of_changes``.
         """
         angles = np.pi * np.linspace(0, 1, ANGLES) ** 2
         depths = MAX_DEPTH * np.linspace(0, 1, DEPTHS) ** 2
         extents = MAX_EXTENT * np.linspace(0, 1, EXTENTS)
-        table = scale * _differences(moments, angles, depths, np.square(extents))
-        table = table.astype(np.float32)
+        differences = _differences(moments, angles, depths, np.square(extents), of_changes)
+        table = (scale * differences).astype(np.float32)
         # GPUs' texture units interpolate with weights of 8 bits: too coarse for angles this small.
         options = {"use_accel": False, "wrap_mode": dr.WrapMode.Clamp}
         self._wide = mi.Texture3f(mi.TensorXf(table[..., None]), **options)
@@ -80,12 +83,18 @@ def _centred(place: mi.Float, count: int) -> mi.Float:
 
 
 def _differences(
-    moments: np.ndarray, angles: np.ndarray, depths: np.ndarray, variances: np.ndarray
+    moments: np.ndarray,
+    angles: np.ndarray,
+    depths: np.ndarray,
+    variances: np.ndarray,
+    of_changes: bool,
 ) -> np.ndarray:
     """Return the sums over Legendre polynomials, an array (variance, depth, angle)."""
     degrees = np.arange(PEAK_MOMENTS)
     depths = np.maximum(depths, 1e-6)[:, None]
     several = np.exp(-depths) * np.expm1(depths * moments) / depths
+    if of_changes:
+        several = np.exp(-depths) - (1 - moments) * np.exp(-depths * (1 - moments))
     coefficients = (2 * degrees + 1) * series_window() * (several - moments)
     blur = np.exp(-0.25 * degrees * (degrees + 1) * variances[:, None])
     polynomials = np.polynomial.legendre.legvander(np.cos(angles), PEAK_MOMENTS - 1)

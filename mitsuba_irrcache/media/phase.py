@@ -12,7 +12,7 @@ coefficients suffice.
 from __future__ import annotations
 
 from copy import copy
-from functools import cache
+from functools import cache, cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -77,6 +77,11 @@ class Phase:
             peak_moments = self._peak_moments()
             self.aureole = Aureole(peak_moments, forward / (1 - forward))
             self.blur = PeakBlur(peak_moments)
+
+    @cached_property
+    def aureole_of_changes(self) -> Aureole:
+        """The derivative of what `aureole` corrects, with respect to the depth of the peak."""
+        return Aureole(self._peak_moments(), self.forward / (1 - self.forward), of_changes=True)
 
     def tail(self, order: int) -> float:
         """Return the largest magnitude of the moments beyond ``order``."""

@@ -79,9 +79,20 @@ def test_emission_has_gradients_with_single_scattering(rgb):
     check(CASES["emission, single"])
 
 
-# The map is also among the gradients in colour, the sharper phase function in empty voxels.
+# The map is also among the gradients in colour, the sharper phase function in empty voxels. Where
+# a sun is behind a forward peak, several scattering events counted as single ones (10 to 50 %).
 @pytest.mark.parametrize(
-    "name", with_slow(["hg 0.3, sun, single", "hg 0.6, envmap", "hg 0.3, point"], "hg 0.6, envmap")
+    "name",
+    with_slow(
+        [
+            "hg 0.3, sun, single",
+            "hg 0.6, envmap",
+            "hg 0.3, point",
+            "hg 0.8, sun behind",
+            "hg 0.8, sun behind, by g",
+        ],
+        "hg 0.6, envmap",
+    ),
 )
 def test_gradients_of_anisotropic_media_are_those_of_the_image(mono, name):
     check(CASES[name])
@@ -451,24 +462,6 @@ def test_inaccurate_derivatives_at_dense_boundaries_are_warned_of(
         dr.backward(loss_of(mi.render(scene, params, spp=4)))
     warnings = [text for text in logged if "derivatives by its extinction" in text]
     assert len(warnings) == expected
-
-
-@pytest.mark.parametrize("lamp", [True, False], ids=["lamp", "sun"])
-def test_only_narrow_sources_beside_a_forward_peak_are_warned_of(rgb, scenes, logged, lamp):
-    """Derivatives neglect that the peak scatters their radiance several times."""
-    medium = scenes.medium(1.0, 0.9) | {"phase": {"type": "hg", "g": 0.7}}
-    emitter = scenes.sun
-    if lamp:
-        above = mi.ScalarTransform4f().look_at([0, 3, 0], [0, 0, 0], [0, 0, 1]).scale(4)
-        area = {"type": "area", "radiance": 1.0}
-        emitter = {"type": "rectangle", "to_world": above, "emitter": area}
-    integrator = {"type": "irrcache", "solver": "sweep", "resolution": 8}
-    scene = scenes.load(integrator, scenes.boundary(medium), 4, emitter=emitter)
-    params = mi.traverse(scene)
-    attached(params, first_key(params, "sigma_t"))
-    dr.backward(loss_of(mi.render(scene, params, spp=4)))
-    warnings = [text for text in logged if "scatters sharply: gradients count" in text]
-    assert len(warnings) == (not lamp)
 
 
 def test_images_with_gradients_do_not_keep_the_scene(rgb):

@@ -23,6 +23,8 @@ POINT = {
     "position": [0.4, 3.0, 1.0],
     "intensity": {"type": "rgb", "value": [20.0, 15.0, 12.0]},
 }
+#: A sun behind the medium, almost in the line of sight of `Case.origin`.
+BEHIND = SUN | {"direction": [1.05, 1.5, -5.0]}
 LAMP = {"type": "point", "position": [0.13, 0.2, -0.1], "intensity": 1.0}
 
 
@@ -243,6 +245,10 @@ def anisotropic() -> dict[str, Case]:
         "hg 0.82, sun, 512 directions": Case(
             g=0.823, emitters=_under(sun=SUN), directions=512, **by_g
         ),
+        "hg 0.8, sun behind": Case(g=0.8, emitters=_under(sun=BEHIND), directions=256, samples=256),
+        "hg 0.8, sun behind, by g": Case(
+            g=0.8, emitters=_under(sun=BEHIND), directions=256, samples=256, **by_g
+        ),
         "hg 0.6, radiance of sky and sun": Case(g=0.6, emitters=both, parameters=("sky", "sun")),
         "hg 0.3, intensity of a point": Case(
             g=0.3, emitters=_under(point=POINT), parameters=("point",)
@@ -409,6 +415,9 @@ def surrounded() -> dict[str, Case]:
         "hg 0.82, ground, sky": Case(g=0.823, objects=ground, **by_g),
         "hg 0.65, two media, sun": Case(
             g=0.65, emitters=_under(sun=SUN), objects=lambda: second_medium(0.5, g=-0.4), **by_g
+        ),
+        "hg 0.7, ground, sun behind": Case(
+            g=0.7, emitters=_under(sun=BEHIND), objects=ground, parameters=(*both, "g")
         ),
         "hg 0.7, panel behind": Case(g=0.7, emitters=dict, objects=lambda: panel(2.0)),
         "hg 0.7, wide panel behind": Case(g=0.7, emitters=dict, objects=lambda: panel(8.0)),

@@ -84,3 +84,17 @@ def test_channels_have_depths_of_their_own():
     found = aureole.correction(cosine, mi.Color3f(0.5, 2.0, 7.0))
     for channel, depth in zip(found, (0.5, 2.0, 7.0), strict=True):
         assert channel[0] == pytest.approx(aureole.correction(cosine, mi.Float(depth))[0])
+
+
+@pytest.mark.parametrize("depth", [0.3, 2.0, 9.0])
+def test_changes_are_derivatives_with_respect_to_the_depth(depth):
+    """Of the depth times the moments, by finite differences of the sum over numbers of events."""
+    moments, share = peak_moments(0.7, 4)
+    step = 1e-4 * depth
+    several = [np.exp(-d) * np.expm1(d * moments) for d in (depth - step, depth + step)]
+    expected = series((several[1] - several[0]) / (2 * step) - moments, ANGLES)
+    aureole = Aureole(moments, share / (1 - share), of_changes=True)
+    cosine = mi.Float(np.cos(ANGLES).astype(np.float32))
+    found = np.array(aureole.correction(cosine, dr.full(mi.Float, depth, len(ANGLES))))
+    largest = np.abs(series(moments, ANGLES)).max()
+    np.testing.assert_allclose(found * (1 - share) / share, expected, atol=0.01 * largest)
