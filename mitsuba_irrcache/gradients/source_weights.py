@@ -82,25 +82,31 @@ class SourceWeights:
         basis: the phase function and the narrow sources.
         depths: optical depths of the peak; None without one.
         visible: whether camera rays attenuate sources that they hit by the scaled extinction.
+        factor: factor of the optical depths.
     """
 
     def __init__(
-        self, basis: AngularBasis, depths: SourceDepths | None, visible: bool = False
+        self,
+        basis: AngularBasis,
+        depths: SourceDepths | None,
+        visible: bool = False,
+        factor: float = 1.0,
     ) -> None:
         self._basis, self._depths, self._visible = basis, depths, visible
-        self._share = 0.0 if depths is None else basis.phase.forward / (1 - basis.phase.forward)
-        #: factor of the optical depths
-        self._factor = 1.0
+        #: f / (1 - f), and factor of the optical depths
+        self._share = dr.opaque(mi.Float, _ratio(basis.phase))
+        self._factor = dr.opaque(mi.Float, factor)
+        # Tables are not left to their first use, in a symbolic loop.
+        self._changes = None if depths is None else basis.phase.aureole_of_changes
 
     def scattered_by(self, phase: Phase) -> SourceWeights:
         """Return the weights for another phase function in a medium of the same extinction and
         albedo after delta-M scaling.
         """
-        basis = AngularBasis(phase, self._basis.sources, order=self._basis.order)
-        weights = SourceWeights(basis, self._depths, self._visible)
-        if self._share:
-            weights._factor = weights._share / self._share
-        return weights
+        own = self._basis
+        basis = AngularBasis(phase, own.sources, order=own.order)
+        factor = _ratio(phase) / _ratio(own.phase) if phase.forward else 1.0
+        return SourceWeights(basis, self._depths, self._visible, factor)
 
     def without_visible(self) -> SourceWeights:
         """Return the weights for rays that do not see the sources."""
@@ -123,9 +129,9 @@ class SourceWeights:
         gains, none = self._basis.gains(p, direction, active), mi.Float(0)
         if self._depths is None:
             return [[SourceWeight(gain, none, none) for gain in gains]]
-        factor, found = dr.opaque(mi.Float, self._factor), []
+        found = []
         for source, gain, own in zip(self._basis.sources, gains, self._depths.at(p), strict=True):
-            depth = (own + peak_depth) * factor
+            depth = (own + peak_depth) * self._factor
             cosine = dr.dot(direction, source.seen_from(p)[0])
             variance = source.variance(p) if source.wide else None
             density = none
@@ -149,12 +155,16 @@ class SourceWeights:
         # docs/primer, eqs. (8.24) and (8.25)
         phase, thin = self._basis.phase, depth < 1e-4
         several = phase.aureole.correction(cosine, depth, variance)
-        change = phase.aureole_of_changes.correction(cosine, depth, variance) - several
+        change = self._changes.correction(cosine, depth, variance) - several
         scattered = absorptance(depth)
         mean = dr.select(thin, 1 - 0.5 * depth, scattered / dr.select(thin, 1, depth))
         return SourceWeight(
             gain + several, density * mean, change - density * (1 - scattered - mean)
         )
+
+
+def _ratio(phase: Phase) -> float:
+    return phase.forward / (1 - phase.forward)
 
 
 def _can_be_hit(source: Source) -> bool:

@@ -291,8 +291,29 @@ SURFACES = (
     Mutant(
         "paths that the camera does not follow have another phase function (g)",
         "gradients/replay.py",
-        "march._neighbours = [each.indirect() for each in marches], factor",
+        "march._neighbours = [each._with_scattering(change) for each in marches], factor",
         "march._neighbours = None",
+        (AMONG_SURFACES,),
+    ),
+    Mutant(
+        "several events into a peak have derivatives of single ones",
+        "gradients/source_weights.py",
+        "change = self._changes.correction(cosine, depth, variance) - several",
+        "change = mi.Float(0)",
+        ("tests/system/test_gradients.py",),
+    ),
+    Mutant(
+        "forward peaks scatter radiance of visible lamps twice",
+        "gradients/source_weights.py",
+        "if self._visible and _can_be_hit(source):",
+        "if False:",
+        (AMONG_SURFACES,),
+    ),
+    Mutant(
+        "hidden lamps count as visible",
+        "gradients/paths.py",
+        "media.without_visible() if hide_emitters else media",
+        "media",
         (AMONG_SURFACES,),
     ),
     Mutant(
