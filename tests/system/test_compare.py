@@ -263,7 +263,7 @@ def test_another_run_finds_the_reference(folder, report, capsys):
     assert "--overwrite" in capsys.readouterr().err
     assert (report / "report.html").read_bytes() == before
     other = folder / "other"
-    assert compare(folder, "-i", "path", "-i", "direct", "--budget", "0.1", "-o", other) == 0
+    assert compare(folder, "-i", "path", "--budget", "0.1", "-o", other) == 0
     assert "Error after equal time" in capsys.readouterr().out
     assert {p: p.stat().st_mtime_ns for p in (folder / "references").iterdir()} == kept
 

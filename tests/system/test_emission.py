@@ -239,7 +239,7 @@ def test_solvers_agree(scenes, max_depth):
     """Both solvers agree for each order and colour; the rays lie outside of all symmetry planes."""
     shape, light = flame(scenes)
     objects = {"sensor": scenes.description({}, None, 24)["sensor"]}
-    settings = {"max_depth": max_depth, "resolution": 32, "cache_spp": 384, "rr_depth": 1000}
+    settings = {"max_depth": max_depth, "resolution": 20, "cache_spp": 384, "rr_depth": 1000}
     settings["objects"] = objects
     images = [rendered(scenes, shape, light, 16, solver=s, **settings)[0] for s in SOLVERS]
     means = [image.mean(axis=(0, 1)) for image in images]

@@ -142,6 +142,9 @@ def volume(tmp_path) -> Path:
     return scene
 
 
+# `test_kills_of_workers_and_of_the_command_leave_no_trace` kills workers, too, and
+# `tests/unit/farm/test_volume.py::test_workers_find_the_bits_of_one_machine` sweeps a volume.
+@pytest.mark.slow
 def test_a_volume_larger_than_memory_is_swept_by_workers_one_of_which_is_killed(volume, tmp_path):
     """The irradiance is that of one machine but for rounding, and frames and images read it."""
     scene, file = volume, tmp_path / "light.npy"

@@ -131,7 +131,7 @@ SMALL = {
 
 @pytest.fixture
 def fewer_paths(monkeypatch):
-    for module, count in ((surroundings_adjoint, 1 << 18), (surroundings_tangent, 1 << 17)):
+    for module, count in ((surroundings_adjoint, 1 << 16), (surroundings_tangent, 1 << 15)):
         monkeypatch.setattr(module, "RAYS", count)
         monkeypatch.setattr(module, "EXCHANGED", count // 4)
 
@@ -173,13 +173,15 @@ def textured() -> mi.Scene:
     return Case(data=6, cache=6, emitters=dict, objects=lambda: objects).load()
 
 
+# Textures of lamps are evaluated like those of surfaces, and upstream variables are in
+# `test_derivatives_of_upstream_variables_reach_the_image`.
 @pytest.mark.parametrize(
     ("part", "is_leaf"),
     [
         ("floor", True),
         pytest.param("floor", False, marks=pytest.mark.slow),
         pytest.param("lamp", True, marks=pytest.mark.slow),
-        ("lamp", False),
+        pytest.param("lamp", False, marks=pytest.mark.slow),
     ],
 )
 def test_textures_of_surfaces_and_lamps_change_once(rgb, fewer_paths, part, is_leaf):
@@ -214,7 +216,8 @@ def test_textures_of_surfaces_and_lamps_change_once(rgb, fewer_paths, part, is_l
     assert found[0] == pytest.approx(found[1], rel=0.02)
 
 
-@pytest.mark.parametrize("name", ["sigma_t", "floor", "lamp"])
+# The radiance of the lamp is a colour as that of the floor.
+@pytest.mark.parametrize("name", with_slow(["sigma_t", "floor", "lamp"], "lamp"))
 def test_other_uses_of_a_parameter_do_not_matter(rgb, fewer_paths, name):
     """Dr.Jit raised an internal error where something else depended on the colour of a surface. A
     later ``dr.backward`` lacked the derivatives through the irradiance if forward mode had reached

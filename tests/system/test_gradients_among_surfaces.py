@@ -32,6 +32,7 @@ from experiments.validation.gradients.differences import (
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients import paths, surroundings, surroundings_adjoint, traced
 from mitsuba_irrcache.gradients.surroundings_adjoint import SurroundingsAdjoint
+from tests.support.slow import with_slow
 
 #: Largest relative error of directional derivatives, and the least cosine. The differences
 #: themselves have a noise of 1 to 2 % (standard deviation over seeds of the cache).
@@ -47,7 +48,7 @@ def fewer_paths(monkeypatch):
 
 def with_gradient_of_albedo() -> tuple[mi.Scene, mi.SceneParameters]:
     """Return a scene with a ground, and the albedo of its medium, which carries gradients."""
-    scene = SURROUNDED["ground, sky"].load()
+    scene = replace(SURROUNDED["ground, sky"], data=8, cache=8, directions=64).load()
     params = mi.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("albedo.data"))
     params.keep([key])
@@ -98,6 +99,15 @@ def test_images_in_one_loss_have_paths_of_their_own(mono, monkeypatch):
         assert np.mean(drawn[k] == drawn[k - 1]) < 1e-3
 
 
+#: What differs in quick cases. On coarse grids and with few samples, errors are about as small.
+QUICK = {"data": 8, "cache": 8, "samples": 64, "directions": 128}
+QUICK_CASES = {
+    "two media, sky": {"data": 12, "cache": 12, "samples": 64},
+    "emission, hg 0.5, sun, single": QUICK | {"depth": 0.2},
+    "hg 0.65, two media, sun": QUICK | {"directions": 256},
+}
+
+
 # Other quick tests cover the slow cases: the test in colour has a floor and a sun, that of panes a
 # window, and `test_a_distant_object_changes_nothing` a distant object.
 @pytest.mark.parametrize(
@@ -124,7 +134,7 @@ def test_images_in_one_loss_have_paths_of_their_own(mono, monkeypatch):
     ],
 )
 def test_gradients_are_those_of_the_image(mono, name, parameters):
-    case = SURROUNDED[name]
+    case = replace(SURROUNDED[name], **QUICK_CASES.get(name, {}))
     scene = case.load()
     weights = pixel_weights(scene)
     found = gradients(scene, parameters, weights)
@@ -134,7 +144,11 @@ def test_gradients_are_those_of_the_image(mono, name, parameters):
         assert result.cosine > COSINE, parameter
 
 
-@pytest.mark.parametrize(("max_depth", "g"), [(2, None), (2, 0.5), (-1, 0.85)])
+# Of the other two, one has single scattering, and one an anisotropic phase function.
+@pytest.mark.parametrize(
+    ("max_depth", "g"),
+    with_slow({"single": (2, None), "both": (2, 0.5), "peak": (-1, 0.85)}, "both"),
+)
 def test_gradients_are_those_of_the_radiance_along_paths(mono, monkeypatch, max_depth, g):
     """The objective by the paths of the gradient themselves has little noise: the same random
     numbers, and no interpolation on surfaces. Adjoint fluence of rays along which nothing may be
@@ -286,9 +300,9 @@ def test_hidden_lamps_do_not_hide_the_medium(mono):
     lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": 1e-4}}
     found = []
     for objects in (dict, lambda: {"front": lamp}):
-        scene = Case(objects=objects).load(hide_emitters=True)
+        scene = Case(data=8, cache=8, objects=objects).load(hide_emitters=True)
         found.append(gradients(scene, ("sigma_t",), pixel_weights(scene))["sigma_t"])
-    smooth = np.array(Case().sigma_t(), dtype=np.float64)
+    smooth = np.array(Case(data=8).sigma_t(), dtype=np.float64)
     alone, hidden = ((each * smooth).sum() for each in found)
     assert hidden == pytest.approx(alone, rel=0.05)
 
@@ -319,7 +333,7 @@ def test_emitters_stay_hidden_behind_panes(mono, opacity):
 def test_gradients_in_colour_are_those_of_the_image(rgb):
     """By the reflectance of the ground, and by the irradiance of the sun."""
     # Derivatives by what images depend on almost linearly have little noise.
-    case = replace(SURROUNDED["ground, sky and sun, in colour"], samples=64)
+    case = replace(SURROUNDED["ground, sky and sun, in colour"], **QUICK)
     scene = case.load()
     weights = pixel_weights(scene)
     names = ("floor", "sun")
@@ -362,13 +376,13 @@ def gradient_of(case: Case, seed: int, **options) -> np.ndarray:
 SMALL = Case(data=6, cache=6, objects=ground)
 
 
-def test_the_same_seed_gives_the_same_bits(rgb, fewer_paths):
+def test_the_same_seed_gives_the_same_bits(mono, fewer_paths):
     first, again, other = (gradient_of(SMALL, seed) for seed in (1, 1, 2))
     assert first.tobytes() == again.tobytes()
     assert first.tobytes() != other.tobytes()
 
 
-def test_views_share_the_adjoint_solve(rgb, fewer_paths, monkeypatch):
+def test_views_share_the_adjoint_solve(mono, fewer_paths, monkeypatch):
     calls, solved = [], SurroundingsAdjoint._solved
     monkeypatch.setattr(
         SurroundingsAdjoint, "_solved", lambda *args: calls.append(args) or solved(*args)
@@ -379,7 +393,7 @@ def test_views_share_the_adjoint_solve(rgb, fewer_paths, monkeypatch):
     assert len(calls) == 1
 
 
-def test_numbers_are_finite_with_black_matter_and_white_walls(rgb, fewer_paths):
+def test_numbers_are_finite_with_black_matter_and_white_walls(mono, fewer_paths):
     for albedo, reflectance in ((0.0, 1.0), (0.9, 1.0)):
         case = Case(data=6, cache=6, albedo=(albedo,), objects=lambda r=reflectance: ground(r))
         scene = case.load()
@@ -421,7 +435,7 @@ INSIDE = {"ball": {"type": "sphere", "radius": 0.3}}
         ),
     ],
 )
-def test_what_has_no_gradients_is_refused_by_name(rgb, case, suffix, properties, reason):
+def test_what_has_no_gradients_is_refused_by_name(mono, case, suffix, properties, reason):
     assert reason in refused(case, suffix, **properties)
 
 
@@ -439,7 +453,8 @@ def dark(name: str) -> tuple[dict, dict, str]:
     return own, ground(), key
 
 
-@pytest.mark.parametrize("name", ["lamp", "point", "sun", "sky"])
+# A point is sampled like the sun.
+@pytest.mark.parametrize("name", with_slow(["lamp", "point", "sun", "sky"], "point"))
 def test_emitters_without_radiance_have_gradients(mono, fewer_paths, name):
     """Samples of emitters without radiance were discarded, so that these gradients were 0."""
     emitters, shapes, key = dark(name)
@@ -475,7 +490,7 @@ def test_textures_of_specular_surfaces_are_refused(rgb, kind):
     assert f"a {kinds[kind]} depends on it" in refused(case, r"object_\d+\.data")
 
 
-def test_many_lamps_around_anisotropic_media_are_refused(rgb, monkeypatch):
+def test_many_lamps_around_anisotropic_media_are_refused(mono, monkeypatch):
     monkeypatch.setattr(traced, "MAX_LAMPS", 0)
     case = replace(SMALL, emitters=dict, objects=lamp, g=0.3)
     assert "1 area emitters" in refused(case, "sigma_t.data")
@@ -503,7 +518,7 @@ def test_a_mean_cosine_of_zero_is_refused(mono):
     assert "it is 0, where scattering is isotropic" in refused(case, "phase_function.g")
 
 
-def test_media_that_lie_within_each_other_are_refused(rgb):
+def test_media_that_lie_within_each_other_are_refused(mono):
     inner = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5}
     ball = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "null"}, "interior": inner}
     scene = Case(data=6, cache=6, objects=lambda: {"inner": ball}).load(solver="auto")

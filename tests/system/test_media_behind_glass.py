@@ -106,7 +106,7 @@ def test_a_lamp_reflected_by_glass_before_a_medium_with_a_forward_peak(scenes):
         "lamp": lamp((-0.4, -0.6, -4.0), (0.2, 0.3, -1.0), 0.7),
         "sun": None,
     }
-    settings = {"solver": "auto", "resolution": 20}
+    settings = {"solver": "auto", "resolution": 12}
     check(*images(scenes, objects, settings, {"max_depth": -1, "rr_depth": 50}, (64, 512)))
 
 

@@ -45,7 +45,7 @@ def test_the_image_is_that_of_separate_meshes(scenes, monkeypatch, objects, solv
     """Shadow rays ended at bounds that were too small, so that floors did not hide the sky, and
     floors among voxels were not found.
     """
-    integrator = {"type": "irrcache", "solver": solver, "resolution": 12, "cache_spp": 128}
+    integrator = {"type": "irrcache", "solver": solver, "resolution": 12, "cache_spp": 32}
     emitter = {"type": "constant", "radiance": colour(1, 1, 1)}
     messages = []
     monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))

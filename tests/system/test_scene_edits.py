@@ -338,7 +338,8 @@ CAMERA_EDITS = {
 }
 
 
-@pytest.mark.parametrize("world", ["lights", "surfaces"])
+# `test_surface_irradiance.py::test_nodes_are_reused_by_another_camera` moves one among surfaces.
+@pytest.mark.parametrize("world", with_slow(["lights", "surfaces"], "surfaces"))
 def test_moved_camera_rebuilds_no_cache(scenes, world, kernels):
     """Moving the camera rebuilds no cache, and launches no kernel to inspect parameters."""
     scene = loaded(scenes, world, "path")

@@ -144,9 +144,11 @@ SCENES = {
 
 #: Scenes of `make stress`. `test_area_lights` has lamps in media, `test_volpath` cameras in media,
 #: `test_surfaces_among_voxels` mirrors, `test_sweep_with_surfaces` points and the ground,
-#: `test_media_behind_glass` glass boundaries; media in coloured extinction are nested below.
+#: `test_media_behind_glass` glass boundaries; media in coloured extinction are nested below, and
+#: `test_mono` has the opaque ball.
 SLOW = (
     "ground and mirror",
+    "opaque ball in fog",
     "lamp inside",
     "bulb inside",
     "camera inside",
