@@ -105,6 +105,7 @@ class AreaLight(DirectLight):
         #: points that represent the emitter for mean lengths
         self._places = _places_on(self._shape)
         self._lookup_points = dr.opaque(mi.UInt32, LOOKUP_POINTS)
+        self._largest_extinction = dr.opaque(mi.Float, medium.sigma_t.maximum)
         super().__init__(scene, emitter, medium, grid, voxels, classes)
         self.maximum = 2 * dr.pi * max(float(c[0]) for c in self._radiance)
 
@@ -205,7 +206,7 @@ class AreaLight(DirectLight):
         ill-conditioned: s is at most the largest extinction of the medium.
         """
         shares, s, i = self._solid_angle.shares(p), sigma_t + dr.zeros_like(depth), mi.UInt32(0)
-        most, is_far = self._medium.sigma_t.maximum, mi.Bool(True)
+        most, is_far = self._largest_extinction, mi.Bool(True)
         while dr.hint(is_far & (i < NEWTON_STEPS), label="Newton steps"):
             passed, slope, total = self._transmittance_of(s, p, shares, count, shift)
             excess = dr.log(dr.maximum(passed / total, 1e-30)) + depth

@@ -37,7 +37,7 @@ def with_forward_peak(
         change: derivative of the share of the forward peak with respect to the mean cosine.
     """
     # docs/primer, eq. (8.14)
-    share, field = medium.phase.forward, medium.sigma_t
+    share, field = dr.opaque(mi.Float, medium.phase.forward), medium.sigma_t
     p = _positions(field.grid)
     by_sigma_t = _channels(found[SIGMA_T], channels)
     sigma_t, albedo = (
@@ -67,7 +67,7 @@ def with_forward_peak(
         result[ALBEDO] += _at_data(medium.original.albedo, p, values, wanted[ALBEDO])
     if MEAN_COSINE in wanted:
         by_share += sum(_total(a * (a - 1) * d) for a, d in by_albedo)
-        result[MEAN_COSINE] = found[MEAN_COSINE] + mi.Float(change * by_share)
+        result[MEAN_COSINE] = found[MEAN_COSINE] + dr.opaque(mi.Float, change * by_share)
     dr.eval(result)
     return result
 
@@ -84,7 +84,8 @@ def changes_without_peak(
         share: change of the share of the forward peak.
     """
     # docs/primer, eq. (8.14), transposed
-    original, peak = medium.original, medium.phase.forward
+    original = medium.original
+    peak, share = (dr.opaque(mi.Float, value) for value in (medium.phase.forward, share))
 
     def at(p: mi.Point3f) -> tuple:
         fields = original.sigma_t, original.albedo, sigma_t, albedo

@@ -6,6 +6,7 @@ a forward peak is truncated, its share depends on g, and so do the scaled extinc
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -41,6 +42,9 @@ class NeighbouringPhases:
 def _with_mean_cosine(phase: Phase, g: float) -> Phase:
     """Return the phase function ``hg`` with mean cosine ``g`` and the order of ``phase``."""
     plugin = mi.load_dict({"type": "hg", "g": g})
+    params = mi.traverse(plugin)
+    params["g"] = dr.opaque(mi.Float, g)  # kernels do not depend on its value
+    params.update()
     moments = g ** np.arange(len(phase.moments), dtype=np.float64)
     if not phase.forward:
         return Phase(plugin, moments, 2 * phase.peak)

@@ -63,6 +63,7 @@ def _scaled(medium: MediumGrid, share: float) -> tuple[Field, Field]:
     finer voxels, until their interpolation preserves scattering and absorption.
     """
     sigma_t, albedo = medium.sigma_t, medium.albedo
+    share = dr.opaque(mi.Float, share)  # kernels do not depend on its value
     for parts in PARTS:
         grids = [f.grid and _divided(f.grid, albedo.grid, parts) for f in (sigma_t, albedo)]
         if parts > 1 and max(g.voxel_count for g in grids if g is not None) > MOST_VOXELS:
@@ -103,7 +104,7 @@ def _divided(grid: Grid, albedo: Grid | None, parts: int) -> Grid:
 
 
 def _error_of_interpolation(
-    medium: MediumGrid, share: float, remaining: Field, scattering: Field
+    medium: MediumGrid, share: mi.Float, remaining: Field, scattering: Field
 ) -> float:
     """Estimate the relative error of the scaled extinction and scattering coefficient, the larger
     of the two, by their mean deviation at random positions in the medium.

@@ -64,6 +64,10 @@ class Phase:
     ) -> None:
         self.plugin, self.moments, self.peak = plugin, moments, peak
         self.forward = forward
+        #: kernels do not depend on its value
+        self._normalization: mi.Float | None = None
+        if plugin is not None:
+            self._normalization = dr.opaque(mi.Float, 4 * np.pi / (1 - forward))
         #: magnitude of moments that are neglected, and the maximum order of the others
         self._neglected = TAIL, MAX_ORDER
         #: moments including the forward peak
@@ -139,7 +143,7 @@ class Phase:
         """
         place = interaction(p, direction)
         value, _ = self.plugin.eval_pdf(mi.PhaseFunctionContext(), place, towards, active)
-        return 4 * dr.pi / (1 - self.forward) * value[0]
+        return self._normalization * value[0]
 
 
 #: Isotropic scattering, of order 0.

@@ -9,14 +9,18 @@ by word. Without these, images stay the same to the bit.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import os
+import sys
 from pathlib import Path
 
 #: LLVM's option that prevents inlining, and the one that skips all passes that are optional.
 OPTIONS = "-inline-threshold=-100000", "-opt-bisect-limit=0"
-#: C++ functions of LLVM: one returns the stream of its messages, the other one gives it a buffer.
-STREAM, BUFFERED = "_ZN4llvm4errsEv", "_ZN4llvm11raw_ostream11SetBufferedEv"
+#: C++ functions of LLVM: the first one returns the stream of its messages, the others give it a
+#: buffer, and write what it has and take it away.
+STREAM = "_ZN4llvm4errsEv"
+BUFFERED, UNBUFFERED = (f"_ZN4llvm11raw_ostream{n}Ev" for n in ("11SetBuffered", "13SetUnbuffered"))
 #: How the lines begin that LLVM prints about each pass that it skips.
 SKIPPED = "BISECT: "
 #: Where the kernels are kept. Their names do not tell by which options they were compiled.
@@ -39,11 +43,28 @@ def shorten_compilation() -> None:
         library.LLVMParseCommandLineOptions(
             len(words), (ctypes.c_char_p * len(words))(*words), None
         )
-        if hasattr(library, STREAM) and hasattr(library, BUFFERED):
-            stream, buffered = library[STREAM], library[BUFFERED]
-            stream.restype = ctypes.c_void_p
-            buffered.argtypes, buffered.restype = [ctypes.c_void_p], None
-            buffered(stream())
+        if all(hasattr(library, name) for name in (STREAM, BUFFERED, UNBUFFERED)):
+            _write_in_blocks(library)
+
+
+def _write_in_blocks(library: ctypes.CDLL) -> None:
+    """Give LLVM's stream of messages a buffer, and discard what it has at the end."""
+    stream = library[STREAM]
+    stream.restype = ctypes.c_void_p
+    method, messages = ctypes.CFUNCTYPE(None, ctypes.c_void_p), ctypes.c_void_p(stream())
+    begin, end = (method((name, library)) for name in (BUFFERED, UNBUFFERED))
+    begin(messages)
+
+    def discard() -> None:
+        sys.stderr.flush()
+        error, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        end(messages)
+        os.dup2(error, 2)
+        os.close(error)
+        os.close(nowhere)
+
+    atexit.register(discard)
 
 
 def without_skipped(text: str) -> str:
