@@ -149,7 +149,7 @@ class MarchedMedia:
         return MarchedMedia([march.indirect() for march in self.marches])
 
     def without_visible(self) -> MarchedMedia:
-        """Return the media for rays that do not see emitters, see `visible_sources`."""
+        """Return the media for rays that do not see emitters, see `source_weights`."""
         return MarchedMedia([march.without_visible() for march in self.marches])
 
     def without_scattering(self) -> MarchedMedia:
@@ -248,7 +248,7 @@ class TracedPaths:
         self._attenuating = None if events is None else media.without_scattering()
         #: the media for rays from voxels and diffuse surfaces
         self._indirect = media.indirect()
-        #: the media for rays of the camera, straight and after reflection or refraction
+        #: the media for rays of the camera that no surface has deflected
         self._straight = media.without_visible() if hide_emitters else media
         self._segments: list[Segment] = []
         self._vertices: list[Vertex | None] = []

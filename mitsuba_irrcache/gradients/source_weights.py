@@ -5,11 +5,11 @@ phase function into a peak of share f, which counts as unscattered, and the rest
 (p - f delta) / (1 - f). Two terms are then added to p / (1 - f):
 
 - The correction for several scattering events into the peak, as in images (`media/aureole`). It
-  depends on the optical depth D of the peak between source and camera. Its derivative with respect
-  to D belongs to all positions on the path. It is attributed to the position where the path bends,
-  which is the same for small angles: there, all paths from a source to a camera ray have the same
-  length and depth, and a peak that scatters w(D) D radiance changes by d(w D)/dD times the change
-  of the depth at each position.
+  depends on the optical depth D of the peak between source and camera, to which all positions on
+  the path contribute. For small angles, all paths from a source to a camera ray have the same D. At
+  all positions together the peak then scatters radiance in proportion to w(D) D, whose derivative
+  with respect to the depth is d(w D)/dD, wherever the depth changes. So this takes the place of
+  w(D) in derivatives with respect to the scattering coefficient.
 - Paths between surfaces attenuate all radiance by the scaled extinction. What the peak scatters of
   sources that they can hit, lamps and bright spots of environments, is then excluded: f / (1 - f)
   times the radiance that is incident from exactly the direction of the ray. For wide lamps the

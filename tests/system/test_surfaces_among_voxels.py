@@ -343,12 +343,15 @@ def test_no_light_enters_a_closed_room(scenes, monkeypatch, thickness):
 
 
 # Fine grids take minutes; coarse ones have all kinds of voxels at edges, too: walls on sides of
-# voxels (12), within voxels (13), of one shape and of several.
+# voxels (12), within voxels (13, 14), of one shape and of several. With 14, the iteration ended
+# while the room, 700 times darker than the fog outside, was 1 to 2 % from its solution.
 @pytest.mark.parametrize(
     ("walls", "resolution"),
     [
-        ("one shape", 12),
+        ("one shape", 14),
         ("six rectangles", 13),
+        pytest.param("one shape", 12, marks=pytest.mark.slow),
+        pytest.param("one shape", 16, marks=pytest.mark.slow),
         pytest.param("one shape", 13, marks=pytest.mark.slow),
         pytest.param("one shape", 24, marks=pytest.mark.slow),
         pytest.param("one shape", 31, marks=pytest.mark.slow),

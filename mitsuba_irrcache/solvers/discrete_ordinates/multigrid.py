@@ -44,8 +44,9 @@ THIN = 1e-2
 #: Relative error of the solution on the finest grid.
 TOLERANCE = 1e-3
 #: Where surfaces divide the voxels, rooms may be darker than the rest: errors are relative to the
-#: irradiance of each voxel plus this share of the mean.
-LOWEST_IRRADIANCE = 1e-2
+#: irradiance of each voxel plus this share of the mean; and the share on the coarsest grid, whose
+#: iterations cost little.
+LOWEST_IRRADIANCE, LOWEST_ON_COARSEST = 1e-2, 1e-4
 #: Relative changes at which the iteration on the coarsest grid ends, if that is the only grid, and
 #: if it only corrects finer ones.
 COARSEST_TOLERANCE, CORRECTION_TOLERANCE = 2e-4, 3e-2
@@ -416,7 +417,7 @@ class MultigridLevel:
         """Solve by source iteration with Anderson acceleration, for few voxels."""
         first = np.array(b, dtype=np.float64).reshape(-1, self.channels).T
         phi, images, residuals = first, [], []
-        scale = np.abs(first).mean(axis=1)
+        scale = np.abs(first).mean(axis=1, keepdims=True)
         for _ in range(MAX_ITERATIONS):
             scattered = np.array(self.collisions(from_numpy(phi.T), table))
             image = scattered.reshape(-1, self.channels).T + first
@@ -427,7 +428,12 @@ class MultigridLevel:
                     "lower the radiance of the emitters (irradiance before scattering: "
                     f"{scale.max():.1e} on average)."
                 )
-            if (np.abs(residual).mean(axis=1) <= self._tolerance * scale).all():
+            largest = scale
+            if self.tracks.surfaces is not None:
+                values = np.abs(image)
+                largest = values + LOWEST_ON_COARSEST * values.mean(axis=1, keepdims=True)
+            change = np.abs(residual) / np.maximum(largest, TINY)
+            if (change.mean(axis=1) <= self._tolerance).all():
                 break
             images, residuals = [*images, image][-HISTORY:], [*residuals, residual][-HISTORY:]
             phi = accelerated(np.array(images), np.array(residuals))
