@@ -100,10 +100,7 @@ class FluenceFields:
         basis = AngularBasis(phase, own.sources, order=own.order)
         fields.angular = self.angular.in_basis(basis)
         basis = AngularBasis(phase, [], order=own.order)
-        factor = 1.0
-        if phase.forward:
-            ratios = [f / (1 - f) for f in (phase.forward, own.phase.forward)]
-            factor = ratios[0] / ratios[1]
+        factor = phase.peak_ratio / own.phase.peak_ratio if phase.forward else 1.0
         fields.direct_lights = [
             DirectLightAlongRays(light, basis, peak_factor=factor) for light in self._lights
         ]

@@ -245,8 +245,7 @@ class CameraReplay:
         length = min(edges, default=float(max(abs(medium.frame[:3, :3]).max(), 1e-30) / 64))
         self.step = dr.opaque(mi.Float, float(length) * step / shorter)
         #: ratio of the extinction of the truncated forward peak to the scattering coefficient
-        forward = medium.phase.forward
-        self._peak_ratio = dr.opaque(mi.Float, forward / (1 - forward))
+        self._peak_ratio = dr.opaque(mi.Float, medium.phase.peak_ratio)
         #: step along lines to lights
         self.path_step = dr.opaque(mi.Float, float(length) * step)
 

@@ -94,7 +94,7 @@ class SourceWeights:
     ) -> None:
         self._basis, self._depths, self._visible = basis, depths, visible
         #: f / (1 - f), and factor of the optical depths
-        self._share = dr.opaque(mi.Float, _ratio(basis.phase))
+        self._share = dr.opaque(mi.Float, basis.phase.peak_ratio)
         self._factor = dr.opaque(mi.Float, factor)
         # Tables are not left to their first use, in a symbolic loop.
         self._changes = None if depths is None else basis.phase.aureole_of_changes
@@ -105,7 +105,7 @@ class SourceWeights:
         """
         own = self._basis
         basis = AngularBasis(phase, own.sources, order=own.order)
-        factor = _ratio(phase) / _ratio(own.phase) if phase.forward else 1.0
+        factor = phase.peak_ratio / own.phase.peak_ratio if phase.forward else 1.0
         return SourceWeights(basis, self._depths, self._visible, factor)
 
     def without_visible(self) -> SourceWeights:
@@ -161,10 +161,6 @@ class SourceWeights:
         return SourceWeight(
             gain + several, density * mean, change - density * (1 - scattered - mean)
         )
-
-
-def _ratio(phase: Phase) -> float:
-    return phase.forward / (1 - phase.forward)
 
 
 def _can_be_hit(source: Source) -> bool:

@@ -79,13 +79,18 @@ class Phase:
         self.blur: PeakBlur | None = None
         if forward and plugin is not None:
             peak_moments = self._peak_moments()
-            self.aureole = Aureole(peak_moments, forward / (1 - forward))
+            self.aureole = Aureole(peak_moments, self.peak_ratio)
             self.blur = PeakBlur(peak_moments)
+
+    @property
+    def peak_ratio(self) -> float:
+        """Ratio of the truncated forward peak to the rest of the phase function."""
+        return self.forward / (1 - self.forward)
 
     @cached_property
     def aureole_of_changes(self) -> Aureole:
         """The derivative of what `aureole` corrects, with respect to the depth of the peak."""
-        return Aureole(self._peak_moments(), self.forward / (1 - self.forward), of_changes=True)
+        return Aureole(self._peak_moments(), self.peak_ratio, of_changes=True)
 
     def tail(self, order: int) -> float:
         """Return the largest magnitude of the moments beyond ``order``."""

@@ -169,8 +169,7 @@ class Projection:
         #: scattering into the truncated forward peak over the remaining scattering coefficient
         self._peak_share: mi.Float | None = None
         if self.truncates_peak:
-            share = medium.phase.forward
-            self._peak_share = dr.opaque(mi.Float, float(share / (1 - share)))
+            self._peak_share = dr.opaque(mi.Float, medium.phase.peak_ratio)
         max_radiance = irradiance.maximum * albedo.maximum / (4 * dr.pi) if irradiance else 0.0
         if self.directional is not None:
             max_radiance *= self.directional.directional.phase.peak

@@ -144,7 +144,7 @@ def test_gradients_are_those_of_the_image(mono, name, parameters):
         assert result.cosine > COSINE, parameter
 
 
-# Of the other two, one has single scattering, and one an anisotropic phase function.
+# The quick cases have single scattering, or an anisotropic phase function.
 @pytest.mark.parametrize(
     ("max_depth", "g"),
     with_slow({"single": (2, None), "both": (2, 0.5), "peak": (-1, 0.85)}, "both"),

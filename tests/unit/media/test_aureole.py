@@ -88,7 +88,7 @@ def test_channels_have_depths_of_their_own():
 
 @pytest.mark.parametrize("depth", [0.3, 2.0, 9.0])
 def test_changes_are_derivatives_with_respect_to_the_depth(depth):
-    """Of the depth times the moments, by finite differences of the sum over numbers of events."""
+    """The table agrees with finite differences of the depth times the moments."""
     moments, share = peak_moments(0.7, 4)
     step = 1e-4 * depth
     several = [np.exp(-d) * np.expm1(d * moments) for d in (depth - step, depth + step)]
