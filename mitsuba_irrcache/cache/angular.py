@@ -218,22 +218,33 @@ class AngularBasis:
         attenuates degree l by exp(-l (l + 1) variance / 4). The part represented by the moments is
         excluded unless ``whole``.
         """
-        result, attenuation, ratio = mi.Float(0), mi.Float(1), mi.Float(1)
-        blur = dr.exp(-0.5 * variance)
-        for legendre, (own, rest) in zip(legendre_polynomials(cosine), self._terms, strict=False):
+        result, series = mi.Float(0), blurred_polynomials(cosine, variance)
+        for (own, rest), (legendre, attenuation) in zip(self._terms, series, strict=False):
             result += (own if whole else rest) * attenuation * legendre
             gain = gain - own * legendre
-            ratio *= blur
-            attenuation *= ratio
+        _, attenuation = next(series)
         return dr.fma(gain, attenuation, result)
 
     def _smooth(self, cosine: mi.Float) -> mi.Float:
         """Evaluate the part of 4 pi p - 1 that the moments represent."""
-        polynomials = islice(legendre_polynomials(cosine), 1, None)
+        polynomials = islice(_legendre(cosine), 1, None)
         return sum(m * p for m, p in zip(self._degrees, polynomials, strict=False))
 
 
-def legendre_polynomials(cosine: mi.Float) -> Iterator[mi.Float]:
+def blurred_polynomials(
+    cosine: mi.Float, variance: mi.Float
+) -> Iterator[tuple[mi.Float, mi.Float]]:
+    """Generate the Legendre polynomials from degree 0 on, and the factor exp(-l (l + 1) v / 4) by
+    which a source with the mean square angle v, the ``variance``, attenuates degree l.
+    """
+    attenuation, ratio, blur = mi.Float(1), mi.Float(1), dr.exp(-0.5 * variance)
+    for polynomial in _legendre(cosine):
+        yield polynomial, attenuation
+        ratio = ratio * blur
+        attenuation = attenuation * ratio
+
+
+def _legendre(cosine: mi.Float) -> Iterator[mi.Float]:
     """Generate the Legendre polynomials from degree 0 on."""
     before, here = mi.Float(0), mi.Float(1)
     for degree in count():

@@ -485,20 +485,24 @@ class DirectLightAlongRays:
         """Evaluate `at` with the forward peak, for an emitter without extent; and that value plus
         the derivative of the `aureole.Aureole` correction, see `gradients/source_weights`.
         """
-        basis = self._basis
-        if basis is None:
-            value = self.at(p, active)
-            return value, value
         value = self.at(p, active, direction, with_peak=True, peak_depth=peak_depth)
-        if not basis.phase.forward:
+        if self._basis is None or not self._basis.phase.forward:
             return value, value
         depth, cosine = self._bend(p, direction, peak_depth)
-        phase = basis.phase
+        phase = self._basis.phase
         change = phase.aureole_of_changes.correction(cosine, depth)
         change -= phase.aureole.correction(cosine, depth)
+        return value, value + self._irradiance(p, active, change)
+
+    def _irradiance(
+        self, p: mi.Point3f, active: mi.Bool, gain: mi.Float | mi.Color3f | None
+    ) -> mi.Spectrum:
+        """Return the irradiance at world positions, times ``gain`` unless it is None."""
         light = self.light
-        passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active) * change
-        return value, value + mi.Spectrum(passed) * light.unobstructed(p, active)
+        passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active)
+        if gain is not None:
+            passed = passed * gain
+        return mi.Spectrum(passed) * light.unobstructed(p, active)
 
     def at(
         self,
@@ -514,11 +518,10 @@ class DirectLightAlongRays:
         towards the camera along ``direction``, averaged over the emitter; ``with_peak`` and
         ``peak_depth`` are as in `AngularField.factor`.
         """
-        light = self.light
-        passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active)
+        gain = None
         if self._basis is not None:
-            passed = passed * self._gain(p, direction, with_peak, peak_depth)
-        return mi.Spectrum(passed) * light.unobstructed(p, active)
+            gain = self._gain(p, direction, with_peak, peak_depth)
+        return self._irradiance(p, active, gain)
 
     def mean_extinction(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
         """Return the mean extinction between world positions and the emitter."""

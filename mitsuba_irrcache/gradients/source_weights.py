@@ -26,7 +26,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import AngularBasis, legendre_polynomials
+from mitsuba_irrcache.cache.angular import AngularBasis, blurred_polynomials
 from mitsuba_irrcache.cache.peak_depths import PeakDepths
 from mitsuba_irrcache.core.fast_math import absorptance
 from mitsuba_irrcache.core.spectrum import interleaved
@@ -177,10 +177,10 @@ def _density(cosine: mi.Float, variance: mi.Float, order: int) -> mi.Float:
     # The heat kernel on the sphere, for short times.
     ratio = dr.sqrt(angle / dr.maximum(dr.sin(angle), 1e-3 * dr.maximum(angle, 1e-3)))
     closed = 4 / narrow * ratio * dr.exp(narrow / 16 - dr.square(angle) / narrow)
-    series, attenuation, factor = mi.Float(0), mi.Float(1), mi.Float(1)
-    blur = dr.exp(-0.5 * variance)
-    for degree, polynomial in enumerate(islice(legendre_polynomials(cosine), order + 1)):
-        series += (2 * degree + 1) * attenuation * polynomial
-        factor *= blur
-        attenuation *= factor
+    series = sum(
+        (2 * degree + 1) * attenuation * polynomial
+        for degree, (polynomial, attenuation) in enumerate(
+            islice(blurred_polynomials(cosine, variance), order + 1)
+        )
+    )
     return dr.select(variance < WIDE, closed, series)

@@ -308,7 +308,7 @@ MUTANTS = (
     Mutant(
         "wide lamps as narrow as points (directional)",
         "cache/angular.py",
-        "attenuation *= ratio",
+        "attenuation = attenuation * ratio",
         "attenuation *= 1",
         ("tests/unit/cache/test_angular.py",),
     ),
