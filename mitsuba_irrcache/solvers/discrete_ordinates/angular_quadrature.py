@@ -19,11 +19,12 @@ their union; independent rotations would have three times the noise.
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import combinations
+from itertools import combinations, combinations_with_replacement
+from math import factorial, prod
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial.legendre import legval
+from numpy.polynomial.legendre import leg2poly
 
 from mitsuba_irrcache.core.sequences import GENERALISED_GOLDEN_RATIOS, fibonacci_hemisphere
 
@@ -97,27 +98,54 @@ def _divided_spiral(sets: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """
     points, turn = fibonacci_hemisphere(sets * count)
     members = strata(sets, turn, 1 / GENERALISED_GOLDEN_RATIOS[1])
-    # The squared error of a set's integrals is the sum of this over all pairs of its points, by the
-    # addition theorem. Two sets exchange those two points that lower it most.
+    # The squared error of a set's integrals is the sum of `_pair_errors` over all pairs of its
+    # points, by the addition theorem. Two sets exchange those two points that lower it most.
+    left, right = _pair_errors(points)
+    own = (left * right).sum(axis=1)
+    totals = right[members].sum(axis=1)
+    exchanges = 0
+    changed, examined = np.zeros(sets, int), np.full((sets, sets), -1)
+    for _ in range(ROUNDS):
+        before = exchanges
+        for a, b in combinations(range(sets), 2):
+            if examined[a, b] >= max(changed[a], changed[b]):
+                continue
+            first, second = members[a], members[b]
+            out = left[first] @ (totals[b] - totals[a]) + own[first]
+            into = left[second] @ (totals[a] - totals[b]) + own[second]
+            change = out[:, None] + into - 2 * (left[first] @ right[second].T)
+            i, j = divmod(int(change.argmin()), change.shape[1])
+            if change[i, j] < -1e-9:
+                moved = right[second[j]] - right[first[i]]
+                totals[a] += moved
+                totals[b] -= moved
+                first[i], second[j] = second[j], first[i]
+                exchanges += 1
+                changed[a] = changed[b] = exchanges
+            else:
+                examined[a, b] = exchanges
+        if exchanges == before:
+            break
+    return points, members
+
+
+def _pair_errors(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two matrices (n, m). Their product ``left @ right.T`` is what pairs of points add to
+    the squared integration error: a polynomial in the cosine, expanded in monomials of coordinates.
+    """
     factors = np.zeros(max(DEGREES) + 1)
     for degree, weight in DEGREES.items():
         factors[degree] = weight * (2 * degree + 1)
-    error = legval(points @ points.T, factors)
-    for _ in range(ROUNDS):
-        exchanged = False
-        for a, b in combinations(range(sets), 2):
-            first, second = members[a], members[b]
-            within, beyond = error[np.ix_(first, first)], error[np.ix_(second, second)]
-            mixed = error[np.ix_(first, second)]
-            out = mixed.sum(axis=1) - within.sum(axis=1) + np.diag(within)
-            into = mixed.sum(axis=0) - beyond.sum(axis=1) + np.diag(beyond)
-            change = out[:, None] + into - 2 * mixed
-            i, j = np.unravel_index(change.argmin(), change.shape)
-            if change[i, j] < -1e-9:
-                first[i], second[j], exchanged = second[j], first[i], True
-        if not exchanged:
-            break
-    return points, members
+    left, right = [], []
+    coefficients = leg2poly(factors)
+    for power in np.flatnonzero(coefficients):
+        for axes in combinations_with_replacement(range(3), power):
+            counts = [axes.count(axis) for axis in range(3)]
+            multinomial = factorial(power) / prod(factorial(count) for count in counts)
+            monomial = np.prod(points**counts, axis=1)
+            left.append(coefficients[power] * multinomial * monomial)
+            right.append(monomial)
+    return np.stack(left, axis=1), np.stack(right, axis=1)
 
 
 def strata(sets: int, coordinate: np.ndarray, step: float) -> np.ndarray:
