@@ -368,15 +368,15 @@ SURFACES = (
     Mutant(
         "no more ordinates through openings",
         "solvers/discrete_ordinates/incident.py",
-        "for above, count in levels if variation > above",
-        "for above, count in ()",
+        "for above, count in levels if variation >= above",
+        "for above, count in () if variation >= above",
         (PHASE,),
     ),
     Mutant(
         "no more ordinates for anisotropic scattering",
         "solvers/discrete_ordinates/incident.py",
-        "least = 0 if is_isotropic else LEAST_FURTHER",
-        "least = 0",
+        "(0.1, 7), (0.0, 3)",
+        "(0.1, 7), (0.0, 0)",
         (PHASE,),
     ),
     Mutant(
