@@ -16,14 +16,15 @@ pytestmark = pytest.mark.usefixtures("rgb")
         ("bright block", "ball of depth 40", 0.9),
         pytest.param("window", "ball of depth 40", 1.4, marks=pytest.mark.slow),
         pytest.param("upper half", "cube of depth 20", 0.6, marks=pytest.mark.slow),
-        ("texture", "smoke of depth 2", 0.3),
+        ("texture", "smoke of depth 2", 0.05),
     ],
 )
 def test_noise_between_seeds(name, body, bound):
     """Images of caches with different seeds agree to ``bound`` % of the mean radiance of the body.
 
     With half a sample of the map per pair of ordinates, or none where its largest radiance was
-    less than 4 times its mean, the noise was 2.0, 2.7, 0.8 and 1.1 %.
+    less than 4 times its mean, the noise was 2.0, 2.7, 0.8 and 1.1 %. Without the exact moments of
+    the map, the last one is 0.17 %.
     """
     found, _ = noise(bodies()[body], maps()[name], seeds=4)
     assert found < bound
