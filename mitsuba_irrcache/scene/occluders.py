@@ -26,6 +26,8 @@ from mitsuba_irrcache.transport.path import (
 OFFSETS = ((0.0, 0.0), (0.5, 0.5))
 #: Margin in voxels: surfaces may lie on the faces of the box.
 SLACK = 1e-3
+#: Classes of shapes that rays hit from outside only, and the one of which there may be instances.
+ONE_SIDED = "BSplineCurve", "LinearCurve", "Ellipsoids", "EllipsoidsMesh", "Instance"
 
 _PICK = np.array(list(np.ndindex(2, 2, 2)), dtype=bool)  # corners of a box
 
@@ -166,6 +168,31 @@ def first_surface(
 
     Returns its distance from ``start`` (0 without one), its normal, and whether there is one.
     """
+    distance, normal, found = _surface_ahead(scene, start, stop, active, opaque, ignored)
+    if dr.hint(has_one_sided_shapes(scene), mode="scalar"):
+        # From inside such a shape only the opposite ray hits the surface between both positions.
+        back, other, met = _surface_ahead(scene, stop, start, active & ~found, opaque, ignored)
+        distance = dr.select(met, dr.norm(stop - start) - back, distance)
+        normal = dr.select(met, other, normal)
+        found |= met
+    return distance, normal, found
+
+
+def has_one_sided_shapes(scene: mi.Scene) -> bool:
+    """Return whether rays may start inside of shapes that they hit from outside only."""
+    return any(shape.class_name() in ONE_SIDED for shape in scene.shapes())
+
+
+@symbolic
+def _surface_ahead(
+    scene: mi.Scene,
+    start: mi.Point3f,
+    stop: mi.Point3f,
+    active: mi.Bool,
+    opaque: bool,
+    ignored: mi.MediumPtr | None,
+):
+    """Find the surface that `first_surface` returns by a ray from ``start``."""
     length = dr.norm(stop - start)
     ray = mi.Ray3f(start, (stop - start) / dr.maximum(length, 1e-30))
     ray.maxt = mi.Float(length)

@@ -210,6 +210,46 @@ def test_voxels_equal_those_of_the_solver_path(scenes, name, depth):
     assert np.abs(both[0] - both[1]).max() < 0.03 * expected.mean() + 4 * noise
 
 
+def one_sided(kind: str, folder, bsdf: dict) -> dict:
+    """Return objects: a rod or a ball of radius 0.3 that rays hit from outside only."""
+    if kind == "ellipsoids":
+        rotation, size = [[0.0, 0, 0, 1]], [[0.1] * 3]  # the surface is at three times the size
+        arrays = {"centers": [[0.0] * 3], "scales": size, "quaternions": rotation}
+        tensors = {name: mi.TensorXf(np.float32(values)) for name, values in arrays.items()}
+        return {"object": {"type": kind, "bsdf": bsdf} | tensors}
+    points = folder / "curve.txt"
+    points.write_text("\n".join(f"0 {y:.2f} 0 0.3" for y in np.linspace(-2, 2, 9)))
+    curve = {"type": "linearcurve" if kind == "linearcurve" else "bsplinecurve"}
+    curve |= {"filename": str(points), "bsdf": bsdf}
+    if kind != "instance":
+        return {"object": curve}
+    group = {"type": "shapegroup", "curve": curve}
+    return {"group": group, "object": {"type": kind, "shapes": ref("group")}}
+
+
+@pytest.mark.parametrize(
+    "kind", with_slow(("bsplinecurve", "instance", "ellipsoids", "linearcurve"), "linearcurve")
+)
+def test_shapes_that_rays_hit_from_outside_only(scenes, tmp_path, kind):
+    """The irradiance around them is that around the same shape with two sides: no radiance passes
+    through them.
+    """
+    bsdf, found = diffuse(0.3, 0.3, 0.3), []
+    rod = {"type": "cylinder", "p0": [0, -2, 0], "p1": [0, 2, 0], "radius": 0.3, "bsdf": bsdf}
+    other = ball((0, 0, 0), 0.3, bsdf=bsdf) if kind == "ellipsoids" else rod
+    for objects in (one_sided(kind, tmp_path, bsdf), {"object": other}):
+        objects = objects | {"fog": bound("cube", fog((1.5,) * 3)), "emitter": scenes.sky}
+        _, cache = rendered(scenes, objects, resolution=16)
+        found.append(np.array(cache.irradiance)[..., 0])
+    x = (np.arange(16) + 0.5) / 8 - 1
+    z, y, x = np.meshgrid(x, x, x, indexing="ij")
+    distance = np.sqrt(x**2 + z**2 + (y**2 if kind == "ellipsoids" else 0))
+    outside = distance > 0.3
+    difference = (found[0] - found[1])[outside] / found[1][outside].mean()
+    assert np.abs(difference).max() < 0.05
+    assert np.sqrt(np.square(difference).mean()) < 0.01
+
+
 def test_images_equal_those_of_volpath(scenes):
     """With a camera in the fog, several objects and a sun."""
     objects = {

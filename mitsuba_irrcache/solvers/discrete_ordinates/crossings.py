@@ -20,7 +20,7 @@ from mitsuba_irrcache.core.jit import concatenated, symbolic
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.occluders import first_surface
+from mitsuba_irrcache.scene.occluders import first_surface, has_one_sided_shapes
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import block_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import (
@@ -71,6 +71,8 @@ class SurfaceVoxels:
         for axis in range(3):
             start, direction, length = _lattice(grid, lower, upper, axis)
             _mark_hits(scene, grid, start, direction, length, marks)
+            if has_one_sided_shapes(scene):
+                _mark_hits(scene, grid, start + direction * length, -direction, length, marks)
             dr.eval(marks)
         self.is_cut = self._within(marks > 0)
         dr.eval(self.is_cut)
