@@ -44,9 +44,9 @@ THIN = 1e-2
 #: Relative error of the solution on the finest grid.
 TOLERANCE = 1e-3
 #: Where surfaces divide the voxels, rooms may be darker than the rest: errors are relative to the
-#: irradiance of each voxel plus this share of the mean; and the share on the coarsest grid, whose
-#: iterations cost little.
-LOWEST_IRRADIANCE, LOWEST_ON_COARSEST = 1e-2, 1e-4
+#: irradiance of each voxel plus this share of the mean. With 1e-2, rooms 400 times darker than the
+#: medium outside were 6 % too bright with more than 140 voxels along a side.
+LOWEST_IRRADIANCE = 1e-4
 #: Relative changes at which the iteration on the coarsest grid ends, if that is the only grid, and
 #: if it only corrects finer ones.
 COARSEST_TOLERANCE, CORRECTION_TOLERANCE = 2e-4, 3e-2
@@ -431,7 +431,7 @@ class MultigridLevel:
             largest = scale
             if self.tracks.surfaces is not None:
                 values = np.abs(image)
-                largest = values + LOWEST_ON_COARSEST * values.mean(axis=1, keepdims=True)
+                largest = values + LOWEST_IRRADIANCE * values.mean(axis=1, keepdims=True)
             change = np.abs(residual) / np.maximum(largest, TINY)
             if (change.mean(axis=1) <= self._tolerance).all():
                 break
