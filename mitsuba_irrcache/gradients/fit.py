@@ -88,6 +88,11 @@ class _Fit:
         self._keys = {name: key_of(self._params, name) for name in names}
         if not views or not names:
             raise IrrcacheError("fit: give at least one view and one parameter.")
+        if settings.views > len(views):
+            raise IrrcacheError(
+                f"fit: views is {settings.views}, but {len(views)} image(s) are to be fitted; set "
+                "it to at most that number, or to 0 for all of them."
+            )
         integrator = scene.integrator()
         has_cache = hasattr(integrator, "cache_spp")
         if not (has_cache or isinstance(integrator, mi.CppADIntegrator)):

@@ -365,6 +365,9 @@ def test_the_command_names_what_is_wrong(folder, capsys):
     assert 'the folder "empty" has no images' in refused("--images", "empty")
     assert "leave at least one to fit" in refused("--images", "images", "--held-out", "4")
     assert "is no checkpoint of a fit" in refused("--images", "images", "--resume")
+    assert "views is 5, but 4 image(s)" in refused(
+        "--images", "images", "--method", "adam", "--views", "5"
+    )
     mi.Bitmap(np.ones((8, 8, 3), np.float32)).write("images/3.exr")
     assert 'image "images/3.exr" has shape (8, 8, 3)' in refused("--images", "images")
     (folder / "images" / "3.exr").write_bytes(b"no image")
