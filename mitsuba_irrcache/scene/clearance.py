@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.lights.emitters import varies_in_space
 from mitsuba_irrcache.scene.consistency import described, ray_offset
 from mitsuba_irrcache.scene.fingerprint import SceneVersion
 from mitsuba_irrcache.transport.path import is_surface
@@ -76,7 +77,8 @@ def separated(scene: mi.Scene) -> mi.Scene | None:
         return None
     # Groups of shapes, of which there may be instances, are not among the shapes of a scene.
     groups = [n for n in mi.traverse(scene).hierarchy if n.class_name() == "ShapeGroupPlugin"]
-    surfaces = _scene_of([*groups, *filter(is_surface, shapes), *scene.sensors()])
+    solid = [_without_texture(shape) for shape in filter(is_surface, shapes)]
+    surfaces = _scene_of([*groups, *solid, *scene.sensors()])
     smaller = {}
     for shape in boundaries:
         if not _has_vertices(shape) and _is_touched(shape, surfaces):
@@ -106,6 +108,19 @@ def separated(scene: mi.Scene) -> mi.Scene | None:
         "few offsets of Mitsuba's rays in between. Images by volpath are wrong there.",
     )
     return result
+
+
+def _without_texture(shape: mi.Shape) -> mi.Shape:
+    """Return ``shape``, or a mesh of the same form if it is a mesh with textured emission.
+
+    Such a mesh refers to the scene that was created last with it: once that scene has been freed,
+    sampling its emission crashes if it has not been sampled before or was edited since.
+    """
+    emitter = shape.emitter()
+    if emitter is None or not shape.is_mesh() or not varies_in_space(emitter):
+        return shape
+    positions = np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64)
+    return _mesh_like(shape, positions.reshape(-1, 3))
 
 
 def _scene_of(objects: list[mi.Object]) -> mi.Scene:
@@ -299,9 +314,11 @@ def _mesh_like(shape: mi.Shape, vertices: np.ndarray) -> mi.Mesh:
     """Return a mesh with the faces, media and BSDF of ``shape``, and other ``vertices`` (n, 3)."""
     props = mi.Properties()
     props["flip_normals"] = shape.has_flipped_normals()
-    props["bsdf"], props["interior"] = shape.bsdf(), shape.interior_medium()
-    if shape.exterior_medium() is not None:
-        props["exterior"] = shape.exterior_medium()
+    props["bsdf"] = shape.bsdf()
+    media = {"interior": shape.interior_medium(), "exterior": shape.exterior_medium()}
+    for side, medium in media.items():
+        if medium is not None:
+            props[side] = medium
     faces = mi.traverse(shape)["faces"]
     mesh = mi.Mesh(shape.id(), len(vertices), len(faces) // 3, props=props)
     values = mi.traverse(mesh)

@@ -27,6 +27,7 @@ from mitsuba_irrcache.lights.emitters import (
     illuminating,
     is_never_sampled,
     kind_of,
+    varies_in_space,
 )
 from mitsuba_irrcache.lights.environments import detail_of, is_uneven
 from mitsuba_irrcache.media.bake import bake, children
@@ -60,6 +61,9 @@ LARGEST_OFFSET = 0.002
 #: Relative difference of the cosines of face normals and interpolated normals of an emissive mesh,
 #: averaged over its area, above which a warning is logged.
 MOST_LOST = 0.02
+#: Area of the faces of an emissive mesh in its texture above which they must overlap there, and
+#: tolerance of texture coordinates.
+LARGEST_TEXTURE, SLACK = 1.001, 1e-3
 #: Number of samples by which the radiance behind media is bounded, and kinds of emitters that are
 #: seen by reflection only.
 BOUND_SAMPLES, REFLECTED = 4096, (EmitterKind.SUN, *POINT_LIKE)
@@ -90,6 +94,7 @@ def compile_scene(
             finest = (upper - lower).max() / STEPS_OF_A_SIDE
             _check_distance(medium.id(), np.abs([lower, upper]).max(), finest)
     for emitter in scene.emitters():
+        _warn_of_shared_texture(emitter)
         check_placement(emitter)
         _warn_of_weight(emitter)
         _warn_of_normals(emitter)
@@ -488,6 +493,31 @@ def _warn_of_directional_area(emitter: mi.Emitter) -> None:
             f'irrcache: emitter "{emitter.id()}" ({emitter.class_name()}) illuminates nothing, as '
             "with volpath: paths from the camera cannot reach it. Use an emitter of the type "
             '"directional", "spot" or "area".',
+        )
+
+
+def _warn_of_shared_texture(emitter: mi.Emitter) -> None:
+    """Log a warning for an emissive mesh with a texture if positions on it share texture
+    coordinates: Mitsuba samples one of them only.
+    """
+    shape = emitter.get_shape()
+    if shape is None or not shape.is_mesh() or not varies_in_space(emitter):
+        return
+    params = mi.traverse(shape)
+    coordinates = np.array(params["vertex_texcoords"], dtype=np.float64).reshape(-1, 2)
+    if not len(coordinates):
+        return
+    corners = coordinates[np.array(params["faces"]).reshape(-1, 3)]
+    sides = corners[:, 1:] - corners[:, :1]
+    area = 0.5 * np.abs(np.linalg.det(sides)).sum()
+    if area > LARGEST_TEXTURE or coordinates.min() < -SLACK or coordinates.max() > 1 + SLACK:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"irrcache: {described(shape)} is a mesh whose radiance is a texture, and parts of it "
+            f"share texture coordinates (its faces cover {area:.2g} times the texture, from "
+            f"{coordinates.min():.2g} to {coordinates.max():.2g}). Mitsuba samples only one of "
+            "these parts, volpath as well: the image is too dark. Give each part of the mesh its "
+            "own coordinates between 0 and 1, or divide it into several shapes.",
         )
 
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
+from mitsuba_irrcache.core.sequences import kronecker
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.consistency import described
@@ -22,8 +23,9 @@ from mitsuba_irrcache.transport.path import (
 )
 
 #: Offsets of the rays along each axis that detect surfaces: through the corners and the centre of
-#: each voxel's face.
-OFFSETS = ((0.0, 0.0), (0.5, 0.5))
+#: each voxel's face; None: through another point of each face, since rays in a lattice miss thin
+#: objects that lie at its distances, such as fences.
+OFFSETS = (0.0, 0.0), (0.5, 0.5), None
 #: Margin in voxels: surfaces may lie on the faces of the box.
 SLACK = 1e-3
 #: Classes of shapes that rays hit from outside only, and the one of which there may be instances.
@@ -37,7 +39,7 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
 
     The box lies between ``lower`` and ``upper`` (x, y, z). The result is exact for shapes whose
     bounding boxes do not overlap the box, for shapes with a vertex in the box, and for shapes
-    inside of it; parts of other shapes are found by rays if they are about as large as a voxel.
+    inside of it; parts of other shapes are found by rays, three for each face of a voxel.
     """
     near = [s for s in scene.shapes() if is_surface(s) and _may_meet(s, grid, lower, upper)]
     for shape in near:
@@ -116,8 +118,12 @@ def _first_hit(scene, near, grid, lower, upper, axis, offset) -> mi.Shape | None
     count = [int(upper[k] - lower[k]) + 1 for k in across]
     positions = unravelled(dr.arange(mi.UInt32, count[0] * count[1]), [Divisor(count[0])])
     p = _opaque(start)
-    for k, position, shift in zip(across, positions, offset, strict=True):
-        position = dr.minimum(mi.Float(position) + _opaque([shift]).x, _opaque([sides[k]]).x)
+    if offset is None:
+        shifts = kronecker(dr.arange(mi.UInt32, count[0] * count[1]), 2)
+    else:
+        shifts = [_opaque([shift]).x for shift in offset]
+    for k, position, shift in zip(across, positions, shifts, strict=True):
+        position = dr.minimum(mi.Float(position) + shift, _opaque([sides[k]]).x)
         p = p + _opaque(steps[:, k]) * position
     met = _shapes_between(
         scene, mi.Point3f(p), mi.Point3f(p + _opaque(steps[:, axis] * sides[axis]))

@@ -366,6 +366,60 @@ def test_texels_of_different_colours(scenes, scale):
     assert np.abs(error).max() < 0.025
 
 
+def shaped_lamp(kind: str, folder, emitter: dict) -> dict:
+    """Return a lamp in the middle: a sphere, or a square mesh with texture coordinates."""
+    if kind == "sphere":
+        return {"type": "sphere", "radius": 0.3, "emitter": emitter}
+    corners = [(-0.3, -0.3), (0.3, -0.3), (0.3, 0.3), (-0.3, 0.3)]
+    lines = [f"v {x} 0 {y}" for x, y in corners] + ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
+    file = folder / "square.obj"
+    file.write_text("\n".join([*lines, "f 1/1 2/2 3/3", "f 1/1 3/3 4/4"]))
+    return {"type": "obj", "filename": str(file), "emitter": emitter}
+
+
+@pytest.mark.usefixtures("rgb")
+@pytest.mark.parametrize("kind", ["sphere", "mesh"])
+def test_textured_emitters_of_uniform_radiance(scenes, tmp_path, kind):
+    """A texture of one colour gives the irradiance of that colour, after an edit, too."""
+    pixels = mi.Bitmap(np.full((4, 4, 3), 2.0, np.float32))
+    texture, found = {"type": "bitmap", "bitmap": pixels, "raw": True}, []
+    for radiance in (texture, {"type": "rgb", "value": 2.0}):
+        lamp = shaped_lamp(kind, tmp_path, {"type": "area", "radiance": radiance})
+        medium = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.8}
+        fog = {"type": "cube", "bsdf": {"type": "null"}, "interior": medium}
+        integrator = {"type": "irrcache", "solver": "sweep", "resolution": 12}
+        scene = scenes.load(integrator, None, fog=fog, lamp=lamp, emitter=None)
+        scenes.image(scene, spp=1)
+        found.append(np.array(scene.integrator().cache.irradiance))
+        params = mi.traverse(scene)
+        moved = "lamp.to_world" if kind == "sphere" else "lamp.vertex_positions"
+        if kind == "sphere":
+            params[moved] = mi.ScalarTransform4f().translate([0, -0.2, 0]).scale(0.3)
+        else:
+            params[moved] = params[moved] - mi.Float([0, 0.2, 0] * 4)
+        params.update()
+        scenes.image(scene, spp=1)
+        found.append(np.array(scene.integrator().cache.irradiance))
+    for own, expected in ((found[0], found[2]), (found[1], found[3])):
+        # Voxels that the lamp cuts are noisy.
+        assert own.mean() == pytest.approx(expected.mean(), rel=0.08)
+
+
+@pytest.mark.usefixtures("rgb")
+def test_shared_texture_coordinates_of_an_emitter_are_warned_of(scenes, logged):
+    """The faces of a cube have the same texture coordinates."""
+    pixels = mi.Bitmap(np.ones((4, 4, 3), np.float32))
+    emitter = {"type": "area", "radiance": {"type": "bitmap", "bitmap": pixels, "raw": True}}
+    place = mi.ScalarTransform4f().translate([0, 1.6, 0]).scale(0.3)
+    lamp = {"type": "cube", "to_world": place, "emitter": emitter}
+    medium = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.8}
+    fog = {"type": "cube", "bsdf": {"type": "null"}, "interior": medium}
+    integrator = {"type": "irrcache", "solver": "sweep", "resolution": 8}
+    scene = scenes.load(integrator, None, fog=fog, lamp=lamp, emitter=None)
+    scenes.image(scene, spp=1)
+    assert any("share texture coordinates" in text and '"lamp"' in text for text in logged)
+
+
 @pytest.mark.usefixtures("rgb")
 @pytest.mark.parametrize(("radius", "is_noisy"), [(0.1, True), (1.0, False)])
 def test_more_samples_where_few_meet_a_lamp(scenes, radius, is_noisy):

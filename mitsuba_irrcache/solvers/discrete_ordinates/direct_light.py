@@ -202,14 +202,18 @@ def _sample_textured(
     that are used equally often (balance heuristic).
 
     Mitsuba samples textures in proportion to their luminance: few points then have the colour of
-    darker texels. Half of the points are therefore sampled from the shape alone, ``by_shape``.
+    darker texels. Half of the points are therefore sampled from the shape alone, ``by_shape``;
+    not those of spheres, whose samples have no texture coordinates.
     """
     shape = emitter.get_shape()
-    record, _ = emitter.sample_direction(vertex, sample)
-    record = dr.select(by_shape, shape.sample_direction(vertex, sample), record)
+    is_sphere = shape.shape_type() == int(mi.ShapeType.Sphere)
+    record, irradiance = emitter.sample_direction(vertex, sample)
+    other = shape.sample_direction(vertex, sample)
+    record = dr.select(by_shape & ~is_sphere, other, record)
     density = emitter.pdf_direction(vertex, record) + shape.pdf_direction(vertex, record)
     radiance = emitter.eval_direction(vertex, record)
-    return record, dr.select(density > 0, radiance * 2 / density, 0)
+    mixture = dr.select(density > 0, radiance * 2 / density, 0)
+    return record, dr.select(is_sphere, irradiance, mixture)
 
 
 @symbolic
