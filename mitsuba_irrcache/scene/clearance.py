@@ -117,7 +117,7 @@ def _without_texture(shape: mi.Shape) -> mi.Shape:
     sampling its emission crashes if it has not been sampled before or was edited since.
     """
     emitter = shape.emitter()
-    if emitter is None or not shape.is_mesh() or not varies_in_space(emitter):
+    if emitter is None or not _has_vertices(shape) or not varies_in_space(emitter):
         return shape
     positions = np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64)
     return _mesh_like(shape, positions.reshape(-1, 3))

@@ -501,12 +501,12 @@ def _warn_of_shared_texture(emitter: mi.Emitter) -> None:
     coordinates: Mitsuba samples one of them only.
     """
     shape = emitter.get_shape()
-    if shape is None or not shape.is_mesh() or not varies_in_space(emitter):
+    if shape is None or not varies_in_space(emitter):
         return
     params = mi.traverse(shape)
-    coordinates = np.array(params["vertex_texcoords"], dtype=np.float64).reshape(-1, 2)
-    if not len(coordinates):
+    if "vertex_texcoords" not in params or not len(params["vertex_texcoords"]):
         return
+    coordinates = np.array(params["vertex_texcoords"], dtype=np.float64).reshape(-1, 2)
     corners = coordinates[np.array(params["faces"]).reshape(-1, 3)]
     sides = corners[:, 1:] - corners[:, :1]
     area = 0.5 * np.abs(np.linalg.det(sides)).sum()
