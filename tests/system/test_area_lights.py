@@ -392,11 +392,10 @@ def test_textured_emitters_of_uniform_radiance(scenes, tmp_path, kind):
         scenes.image(scene, spp=1)
         found.append(np.array(scene.integrator().cache.irradiance))
         params = mi.traverse(scene)
-        moved = "lamp.to_world" if kind == "sphere" else "lamp.vertex_positions"
         if kind == "sphere":
-            params[moved] = mi.ScalarTransform4f().translate([0, -0.2, 0]).scale(0.3)
+            params["lamp.to_world"] = mi.ScalarTransform4f().translate([0, -0.2, 0]).scale(0.3)
         else:
-            params[moved] = params[moved] - mi.Float([0, 0.2, 0] * 4)
+            params["lamp.vertex_positions"] -= mi.Float([0, 0.2, 0] * 4)
         params.update()
         scenes.image(scene, spp=1)
         found.append(np.array(scene.integrator().cache.irradiance))

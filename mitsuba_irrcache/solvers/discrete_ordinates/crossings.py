@@ -67,11 +67,11 @@ class SurfaceVoxels:
     ) -> None:
         self.scene, self.grid, self.lower, self.upper = scene, grid, lower, upper
         self.medium = medium
-        marks = dr.zeros(mi.UInt32, grid.voxel_count)
+        marks, both_ways = dr.zeros(mi.UInt32, grid.voxel_count), has_one_sided_shapes(scene)
         for axis in range(3):
             start, direction, length = _lattice(grid, lower, upper, axis)
             _mark_hits(scene, grid, start, direction, length, marks)
-            if has_one_sided_shapes(scene):
+            if both_ways:
                 _mark_hits(scene, grid, start + direction * length, -direction, length, marks)
             dr.eval(marks)
         self.is_cut = self._within(marks > 0)

@@ -55,6 +55,8 @@ ANISOTROPIC_FURTHER = (0.4, 15), (0.1, 7), (0.0, 3)
 #: The same for isotropic scattering, which has less noise, and more of it from the radiance between
 #: voxels: around a ball or below an arch, 15 times as many ordinates have the noise of 3 times as
 #: many, in three times the time. A room with a small window (variation 4.9) has half the noise.
+#: There are none where little is occluded: radiance of surfaces does not enter along them, so that
+#: under a uniform sky above white ground dense voxels would have an error of 2.5 instead of 0.5 %.
 ISOTROPIC_FURTHER = (3.5, 15), (0.6, 3)
 #: Number of directions that are sampled to find moments.
 SAMPLES = 1 << 14
