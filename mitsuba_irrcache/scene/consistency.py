@@ -31,6 +31,9 @@ WALKS, WALKS_PER_SHAPE, MOST_WALKS, SENSOR_WALKS = 2048, 256, 1 << 16, 1024
 EVENTS, TURNS = 24, 0.25
 #: Maximum number of suspected positions that are tested, and number of rays from each.
 PLACES, RAYS = 64, 64
+#: Number of camera rays by which the position of the near plane is tested, and share of them that
+#: begin in a medium above which a warning is logged.
+VIEW_RAYS, LEAST_WITHIN = 1024, 0.02
 #: Positions are sampled on a flight down to a distance of exp(-NEAREST) of its length to its ends.
 NEAREST = 6.0
 #: A position is disputed if at least `DISSENT` of its rays contradict the others, and a scene is
@@ -118,20 +121,32 @@ def check_sensor(scene: mi.Scene, sensor: mi.Sensor) -> None:
 
 
 def warn_of_missing_medium(scene: mi.Scene, sensor: mi.Sensor) -> None:
-    """Log a warning for a sensor in a medium that it does not name: its rays begin outside."""
+    """Log a warning for a sensor in a medium that it does not name, or whose near plane is partly
+    in a medium: its rays begin outside.
+    """
     if sensor.get_medium() is not None:
         return
-    ray, _ = camera_rays(sensor, RAYS)
+    ray, _ = camera_rays(sensor, VIEW_RAYS)
     code, found, _ = _claims(scene, mi.Ray3f(ray.o, ray.d))
     number = dr.select(code == _CLAIM, dr.reinterpret_array(mi.UInt32, found), 0)
     known = dr.count(code != _NOTHING)
     dr.eval(number, known)
     around = np.array(number)
     around = around[around > 0]
-    if around.size <= 0.5 * int(known[0]):
+    share = around.size / max(int(known[0]), 1)
+    if share <= LEAST_WITHIN:
         return
     named = Counter(around.tolist()).most_common(1)[0][0]
     shapes = scene.shapes()
+    if share <= 0.5:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'irrcache: the near plane of sensor "{sensor.id()}" lies in '
+            f"{_Names(shapes, shapes).medium(named)} in {share:.0%} of its view. Rays that begin "
+            "there begin in vacuum, as with Mitsuba's integrators: the image lacks the medium "
+            "before the first surface, and is not that of volpath either. Lower near_clip.",
+        )
+        return
     mi.Log(
         mi.LogLevel.Warn,
         f'irrcache: sensor "{sensor.id()}" is located in {_Names(shapes, shapes).medium(named)}, '

@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import concatenated, symbolic
+from mitsuba_irrcache.core.sequences import kronecker_words, unit_floats
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -363,13 +364,16 @@ def _lattice(
 ) -> tuple[mi.Point3f, mi.Vector3f, float]:
     """Return rays along an axis of the grid, `RAYS_PER_EDGE`^2 in each row of voxels of the box:
     origins, direction, and length.
+
+    They do not lie in a lattice, whose rays would miss thin objects at the distances of voxels.
     """
     across = [k for k in range(3) if k != axis]
     count = [int(upper[k] - lower[k]) * RAYS_PER_EDGE for k in across]
     row, column = block_and_index(count[0], count[1])
     place = [dr.opaque(mi.Float, float(n)) for n in lower]
-    for k, i in zip(across, (column, row), strict=True):
-        place[k] = place[k] + (mi.Float(i) + 0.5) * (1 / RAYS_PER_EDGE)
+    words = kronecker_words(dr.arange(mi.UInt32, count[0] * count[1]), [mi.UInt32(1 << 31)] * 2)
+    for k, i, shift in zip(across, (column, row), unit_floats(words), strict=True):
+        place[k] = place[k] + (mi.Float(i) + shift) * (1 / RAYS_PER_EDGE)
     step = grid.world.matrix[:3, axis] * float(upper[axis] - lower[axis])
     length = float(np.linalg.norm(step))
     direction = mi.Vector3f([dr.opaque(mi.Float, float(v)) for v in step / length])

@@ -215,3 +215,18 @@ def test_sensors_in_media_that_they_do_not_name_are_noted(scenes, monkeypatch, p
         mi.load_dict({"type": "scene", "fog": fog, "eye": sensor, "box": box, "ball": ball})
     )
     assert sum('"eye" is located in medium "fog"' in text for text in messages) == warns
+
+
+@pytest.mark.parametrize(("near", "warns"), [(4.0, 1), (3.0, 0)])
+def test_near_planes_that_cut_a_medium_are_noted(scenes, monkeypatch, near, warns):
+    """A part of the image lacked the medium between near plane and surfaces, without a word."""
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
+    fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5, "id": "fog"}
+    to_world = mi.ScalarTransform4f().look_at([0, 0, -5], [0, 0, 0], [0, 1, 0])
+    sensor = {"type": "perspective", "to_world": to_world, "near_clip": near, "id": "eye"}
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 45)
+    box = {"type": "cube", "to_world": turned, "bsdf": {"type": "null"}, "interior": fog}
+    ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.2}
+    compile_scene(mi.load_dict({"type": "scene", "eye": sensor, "box": box, "ball": ball}))
+    assert sum('near plane of sensor "eye" lies in medium "fog"' in m for m in messages) == warns
