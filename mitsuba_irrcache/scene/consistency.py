@@ -101,17 +101,30 @@ def check_sensor(scene: mi.Scene, sensor: mi.Sensor) -> None:
     if medium is None:
         return
     shapes = [s for s in scene.shapes() if _bounds(s)]
-    ray, _ = camera_rays(sensor, RAYS)
+    ray, _ = camera_rays(sensor, VIEW_RAYS)
     code, found, shape = _claims(scene, mi.Ray3f(ray.o, ray.d))
     outside = _nothing_is_outside(shapes)
     known = (code == _CLAIM) | (code == _ESCAPE) & outside
     wrong = known & (found != mi.MediumPtr(medium))
     number = dr.reinterpret_array(mi.UInt32, shape)
     dr.eval(known, wrong, number)
-    if int(dr.count(wrong)[0]) <= 0.5 * max(int(dr.count(known)[0]), 1):
+    share = int(dr.count(wrong)[0]) / max(int(dr.count(known)[0]), 1)
+    if share <= ASTRAY:
         return
     named = Counter(np.array(number)[np.array(wrong)].tolist()).most_common(1)[0][0]
     by = _Names(shapes, scene.shapes()).shape(named)
+    if share <= 0.5:
+        at = dr.gather(mi.Point3f, ray.o, dr.compress(wrong)[:PLACES])
+        votes = [_by_medium(v).most_common(1)[0][0] for v in _examine(scene, at, outside) if v]
+        if votes.count(_number(mi.MediumPtr(medium))) >= 0.5 * len(votes):
+            return  # the shapes contradict each other, which `check_media_agree` refuses
+        raise UnsupportedSceneError(
+            f'irrcache: sensor "{sensor.id()}" has the medium "{medium.id()}", but {share:.0%} of '
+            f"its rays begin outside of it, according to {by}: its near plane or aperture is "
+            "partly in the medium. Lower near_clip or the radius of the aperture, or move it. "
+            'Otherwise render this scene with "volpath", which then extends the medium up to the '
+            "next shape."
+        )
     raise UnsupportedSceneError(
         f'irrcache: sensor "{sensor.id()}" has the medium "{medium.id()}", but is not located in '
         f"it, according to {by}. Remove the medium from the sensor, name the one in which it is "

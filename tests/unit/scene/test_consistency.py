@@ -217,16 +217,28 @@ def test_sensors_in_media_that_they_do_not_name_are_noted(scenes, monkeypatch, p
     assert sum('"eye" is located in medium "fog"' in text for text in messages) == warns
 
 
+def cut_by_a_near_plane(near: float, named: bool) -> dict:
+    """A cube of fog that the plane of a sensor at distance ``near`` may cut."""
+    to_world = mi.ScalarTransform4f().look_at([0, 0, -5], [0, 0, 0], [0, 1, 0])
+    sensor = {"type": "perspective", "to_world": to_world, "near_clip": near, "fov": 30.0}
+    sensor["id"] = "eye"
+    if named:
+        sensor["medium"] = {"type": "ref", "id": "fog"}
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 45)
+    box = bound("cube", turned.matrix, {"type": "ref", "id": "fog"})
+    ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.2}
+    return {"medium": fog() | {"id": "fog"}, "box": box, "eye": sensor, "ball": ball}
+
+
 @pytest.mark.parametrize(("near", "warns"), [(4.0, 1), (3.0, 0)])
 def test_near_planes_that_cut_a_medium_are_noted(scenes, monkeypatch, near, warns):
     """A part of the image lacked the medium between near plane and surfaces, without a word."""
     messages = []
     monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
-    fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5, "id": "fog"}
-    to_world = mi.ScalarTransform4f().look_at([0, 0, -5], [0, 0, 0], [0, 1, 0])
-    sensor = {"type": "perspective", "to_world": to_world, "near_clip": near, "id": "eye"}
-    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 45)
-    box = {"type": "cube", "to_world": turned, "bsdf": {"type": "null"}, "interior": fog}
-    ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.2}
-    compile_scene(mi.load_dict({"type": "scene", "eye": sensor, "box": box, "ball": ball}))
+    compile_scene(load(**cut_by_a_near_plane(near, named=False)))
     assert sum('near plane of sensor "eye" lies in medium "fog"' in m for m in messages) == warns
+
+
+def test_near_planes_that_leave_the_medium_of_the_sensor_are_refused():
+    with pytest.raises(UnsupportedSceneError, match=r'"eye".*of its rays begin outside.*near_clip'):
+        compile_scene(load(**cut_by_a_near_plane(4.7, named=True)))
