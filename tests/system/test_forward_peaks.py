@@ -167,7 +167,8 @@ def test_shadows(kind, objects):
     # With 16 voxels the largest error is 2.4 % beside the ball, with 32 it is 1.2 %.
     settings = {"resolution": 32} if objects else None
     own_spp = 256 if kind == "panel" else 64
-    mean, block, noise = error(BELOW_THE_CLOUD, 6144, settings, own_spp, **scene)
+    spp = 16384 if kind in ("lamp", "point") else 6144
+    mean, block, noise = error(BELOW_THE_CLOUD, spp, settings, own_spp, **scene)
     assert noise < 0.006
     assert abs(mean) < 0.01 + noise
     assert block < 0.025 + 2 * noise
