@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
-from mitsuba_irrcache.core.sequences import kronecker
+from mitsuba_irrcache.core.sequences import kronecker_words, unit_floats
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.consistency import described
@@ -22,10 +22,8 @@ from mitsuba_irrcache.transport.path import (
     transmits,
 )
 
-#: Offsets of the rays along each axis that detect surfaces: through the corners and the centre of
-#: each voxel's face; None: through another point of each face, since rays in a lattice miss thin
-#: objects that lie at its distances, such as fences.
-OFFSETS = (0.0, 0.0), (0.5, 0.5), None
+#: Number of rays per edge of a voxel that detect surfaces.
+DETECTING_RAYS = 3
 #: Margin in voxels: surfaces may lie on the faces of the box.
 SLACK = 1e-3
 #: Classes of shapes that rays hit from outside only, and the one of which there may be instances.
@@ -39,19 +37,44 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
 
     The box lies between ``lower`` and ``upper`` (x, y, z). The result is exact for shapes whose
     bounding boxes do not overlap the box, for shapes with a vertex in the box, and for shapes
-    inside of it; parts of other shapes are found by rays, three for each face of a voxel.
+    inside of it; parts of other shapes are found by `DETECTING_RAYS`^2 rays through each face of a
+    voxel.
     """
     near = [s for s in scene.shapes() if is_surface(s) and _may_meet(s, grid, lower, upper)]
     for shape in near:
         if _is_partly_within(shape, grid, lower, upper):
             return described(shape)
-    if near:
-        for axis in range(3):
-            for offset in OFFSETS:
-                found = _first_hit(scene, near, grid, lower, upper, axis, offset)
-                if found is not None:
-                    return described(found)
+    for axis in range(3 if near else 0):
+        met = _shapes_between(
+            scene, *rays_through_faces(grid, lower, upper, axis, DETECTING_RAYS, SLACK)
+        )
+        dr.eval(met)
+        if dr.any(met != None):  # noqa: E711
+            return described(next((s for s in near if dr.any(met == mi.ShapePtr(s))), near[0]))
     return None
+
+
+def rays_through_faces(
+    grid: Grid, lower: np.ndarray, upper: np.ndarray, axis: int, per_edge: int, inset: float = 0.0
+) -> tuple[mi.Point3f, mi.Point3f]:
+    """Return both ends of rays along an axis of the grid through a box of voxels, ``per_edge``^2
+    in each row of voxels: world positions, at most ``inset`` [voxels] from the faces of the box.
+
+    The rays are not in a lattice, which would miss thin objects at the distances of voxels, such as
+    fences: each lies anywhere in its square (a Kronecker sequence).
+    """
+    across = [k for k in range(3) if k != axis]
+    count = [int(upper[k] - lower[k]) * per_edge for k in across]
+    index = dr.arange(mi.UInt32, count[0] * count[1])
+    square = unravelled(index, [Divisor(count[0])])
+    within = unit_floats(kronecker_words(index, [mi.UInt32(1 << 31)] * 2))
+    first, low, high = (_opaque(corner) for corner in (lower, lower + inset, upper - inset))
+    start, stop = mi.Point3f(low), mi.Point3f(low)
+    for k, number, shift in zip(across, square, within, strict=True):
+        place = first[k] + (mi.Float(number) + shift) / per_edge
+        start[k] = stop[k] = dr.clip(place, low[k], high[k])
+    stop[axis] = high[axis]
+    return grid.world.point(start), grid.world.point(stop)
 
 
 def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
@@ -107,31 +130,6 @@ def _is_partly_within(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.
     ends = np.where(_PICK, np.array(box.max), np.array(box.min))
     u = _mapped(grid.coordinates.matrix, ends)
     return bool((u > lower).all() and (u < upper).all())
-
-
-def _first_hit(scene, near, grid, lower, upper, axis, offset) -> mi.Shape | None:
-    """Return one of the shapes ``near`` that rays along an axis of the grid hit in the box."""
-    across = [k for k in range(3) if k != axis]
-    corner, sides = lower + SLACK, upper - lower - 2 * SLACK
-    steps = grid.world.matrix[:3, :3]  # a voxel along each axis
-    start = steps @ corner + grid.world.matrix[:3, 3]
-    count = [int(upper[k] - lower[k]) + 1 for k in across]
-    positions = unravelled(dr.arange(mi.UInt32, count[0] * count[1]), [Divisor(count[0])])
-    p = _opaque(start)
-    if offset is None:
-        shifts = kronecker(dr.arange(mi.UInt32, count[0] * count[1]), 2)
-    else:
-        shifts = [_opaque([shift]).x for shift in offset]
-    for k, position, shift in zip(across, positions, shifts, strict=True):
-        position = dr.minimum(mi.Float(position) + shift, _opaque([sides[k]]).x)
-        p = p + _opaque(steps[:, k]) * position
-    met = _shapes_between(
-        scene, mi.Point3f(p), mi.Point3f(p + _opaque(steps[:, axis] * sides[axis]))
-    )
-    dr.eval(met)
-    if not dr.any(met != None):  # noqa: E711
-        return None
-    return next((s for s in near if dr.any(met == mi.ShapePtr(s))), near[0])
 
 
 def _opaque(values: Sequence[float]) -> mi.Vector3f:

@@ -17,11 +17,14 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import concatenated, symbolic
-from mitsuba_irrcache.core.sequences import kronecker_words, unit_floats
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.occluders import first_surface, has_one_sided_shapes
+from mitsuba_irrcache.scene.occluders import (
+    first_surface,
+    has_one_sided_shapes,
+    rays_through_faces,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import block_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import (
@@ -70,10 +73,10 @@ class SurfaceVoxels:
         self.medium = medium
         marks, both_ways = dr.zeros(mi.UInt32, grid.voxel_count), has_one_sided_shapes(scene)
         for axis in range(3):
-            start, direction, length = _lattice(grid, lower, upper, axis)
-            _mark_hits(scene, grid, start, direction, length, marks)
+            start, stop = rays_through_faces(grid, lower, upper, axis, RAYS_PER_EDGE)
+            _mark_hits(scene, grid, start, stop, marks)
             if both_ways:
-                _mark_hits(scene, grid, start + direction * length, -direction, length, marks)
+                _mark_hits(scene, grid, stop, start, marks)
             dr.eval(marks)
         self.is_cut = self._within(marks > 0)
         dr.eval(self.is_cut)
@@ -359,38 +362,17 @@ def _parameters(geometry: TrackGeometry) -> tuple[mi.Int32, mi.Float]:
     return mi.Int32(integers.ravel().tolist()), mi.Float(sizes.ravel().tolist())
 
 
-def _lattice(
-    grid: Grid, lower: np.ndarray, upper: np.ndarray, axis: int
-) -> tuple[mi.Point3f, mi.Vector3f, float]:
-    """Return rays along an axis of the grid, `RAYS_PER_EDGE`^2 in each row of voxels of the box:
-    origins, direction, and length.
-
-    They do not lie in a lattice, whose rays would miss thin objects at the distances of voxels.
-    """
-    across = [k for k in range(3) if k != axis]
-    count = [int(upper[k] - lower[k]) * RAYS_PER_EDGE for k in across]
-    row, column = block_and_index(count[0], count[1])
-    place = [dr.opaque(mi.Float, float(n)) for n in lower]
-    words = kronecker_words(dr.arange(mi.UInt32, count[0] * count[1]), [mi.UInt32(1 << 31)] * 2)
-    for k, i, shift in zip(across, (column, row), unit_floats(words), strict=True):
-        place[k] = place[k] + (mi.Float(i) + shift) * (1 / RAYS_PER_EDGE)
-    step = grid.world.matrix[:3, axis] * float(upper[axis] - lower[axis])
-    length = float(np.linalg.norm(step))
-    direction = mi.Vector3f([dr.opaque(mi.Float, float(v)) for v in step / length])
-    return grid.world.point(mi.Point3f(place)), direction, length
-
-
 @symbolic
 def _mark_hits(
     scene: mi.Scene,
     grid: Grid,
     start: mi.Point3f,
-    direction: mi.Vector3f,
-    length: float,
+    stop: mi.Point3f,
     marks: mi.UInt32,
 ):
-    """Mark the voxels in which rays hit surfaces that are not null boundaries."""
-    length = dr.opaque(mi.Float, length)
+    """Mark the voxels in which rays between two ends hit surfaces that are not null boundaries."""
+    length = dr.norm(stop - start)
+    direction = (stop - start) / length
     ray, active, crossings = mi.Ray3f(start, direction), mi.Bool(True), mi.UInt32(0)
     ray.maxt = mi.Float(length)
     while dr.hint(active, label="surface voxels"):
