@@ -1,9 +1,10 @@
 """Division of cells, the boxes between eight voxel centres, by the surfaces that cut them.
 
-The surfaces in a cell are approximated by planes: first those that separate most of the pairs of
-corners that do not see each other, then others, such as the second face of a wall, or a lamp in
-front of it. The planes divide the cell into regions. The corners whose values are valid in a region
-are those that most positions in it see, as far as they see each other.
+The surfaces in a cell are approximated by planes, or by spheres if they are curved: first those
+that separate most of the pairs of corners that do not see each other, then others, such as the
+second face of a wall, or a lamp in front of it. They divide the cell into regions. The corners
+whose values are valid in a region are those that most positions in it see, as far as they see each
+other.
 """
 
 from __future__ import annotations
@@ -43,6 +44,9 @@ OTHER_DISTANCE, OTHER_COSINE = 0.05, 0.9
 #: Scores of planes: for each visible pair of corners that they separate, and for their distance
 #: from the centre of the cell in voxels. Each separated pair that is not visible adds 1.
 HARM, REMOTENESS = -0.25, -0.1
+#: Normals whose cosine with that of a surface is larger determine its curvature, which is at most
+#: `MOST_CURVED` [1/voxel].
+CURVED_COSINE, MOST_CURVED = 0.7, 1.0
 #: Positions per cell from which the visible corners are determined, and the weight of those that
 #: see no backs of surfaces: the others are likely to lie in objects.
 POSITIONS, IN_FRONT = 64, 64
@@ -62,6 +66,8 @@ class CellSides:
         found: indices of the cut cells.
         planes: for each of them, `PLANES` planes (g, c), with g s + c = 0 for coordinates s in
             voxels that are 0 at the centre of the first voxel.
+        curvatures: the curvature k of each plane: the surface is g s + c + k |s - m|^2 / 2 = 0,
+            where m is the middle of the cell.
         corners: for each of them, the mask of the valid corners of each region (see `region_of`),
             8 bits each, `PER_WORD` in a word.
     """
@@ -79,6 +85,7 @@ class CellSides:
         self.planes = dr.zeros(mi.Float, 4 * count * PLANES)
         # Without a surface, a plane is one that has all positions in front of it.
         dr.scatter(self.planes, mi.Vector4f(0, 0, 0, 1), index)
+        self.curvatures = dr.zeros(mi.Float, count * PLANES)
         blocked, simple = self._find_planes()
         self.corners = dr.zeros(mi.UInt32, count * WORDS)
         if dr.any(simple):
@@ -148,17 +155,22 @@ class CellSides:
         for number in range(PLANES):
             pairs, rest = (dr.gather(mi.UInt64, values, chosen) for values in (blocked, left))
             cell = dr.gather(mi.UInt32, self.found, chosen)
-            known = planes_of(self.planes, chosen)
-            score, plane, separated = self._best_plane(cell, pairs, rest, known)
+            known = [plane for plane, _ in planes_of(self.planes, self.curvatures, chosen)]
+            score, plane, point, separated = self._best_plane(cell, pairs, rest, known)
             is_new = score > -dr.inf
-            dr.eval(is_new, plane, separated)
-            dr.scatter(self.planes, plane, chosen * PLANES + number, is_new)
+            dr.eval(is_new, plane, point, separated)
+            curved, curvature = self._curved(cell, plane, point, is_new)
+            fits = _separated(curved, curvature, self._first(cell)) == separated
+            dr.scatter(
+                self.planes, dr.select(fits, curved, plane), chosen * PLANES + number, is_new
+            )
+            dr.scatter(self.curvatures, curvature, chosen * PLANES + number, is_new & fits)
             dr.scatter(left, rest & ~separated, chosen, is_new)
             if number == 0:
                 dr.scatter(exact, is_new & (separated == pairs), chosen)
             else:
                 dr.scatter(more, mi.Bool(True), chosen, is_new)
-            dr.eval(self.planes, left, exact, more)
+            dr.eval(self.planes, self.curvatures, left, exact, more)
             kept = dr.compress(is_new)
             if not dr.width(kept):
                 break
@@ -174,31 +186,25 @@ class CellSides:
 
         ``pairs`` are those of corners that do not see each other, ``rest`` those that the ``known``
         planes do not separate. A plane separates some of these, or is another one than those known.
-        Returns its score, -inf if there is none, the plane, and the pairs that it separates.
+        Returns its score, -inf if there is none, the plane, a position on the surface, and the
+        pairs that the plane separates.
         """
         first = self._first(cell)
         middle = first + 0.5
-        axes = [
-            self._grid.world.vector(mi.Vector3f(*unit))
-            for unit in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-        ]
-        best, plane, separated = mi.Float(-dr.inf), mi.Vector4f(0, 0, 0, 1), mi.UInt64(0)
+        best, separated = mi.Float(-dr.inf), mi.UInt64(0)
+        plane, point = mi.Vector4f(0, 0, 0, 1), mi.Point3f(0)
         starts, ends = _tables(SEGMENTS)
         k, count = mi.UInt32(0), dr.opaque(mi.UInt32, len(SEGMENTS))
         while dr.hint(k < count, label="planes of cells"):
             a, b = _segment(first, dr.gather(mi.UInt32, starts, k), dr.gather(mi.UInt32, ends, k))
-            distance, normal, hit = self._surface(a, b)
-            length = dr.norm(self._world(b) - self._world(a))
-            at = a + (b - a) * (distance / length)
-            steps = mi.Vector3f([dr.dot(normal, axis) for axis in axes])
-            steps /= dr.maximum(dr.norm(steps), 1e-30)
+            at, steps, hit = self._tangent(a, b, mi.Bool(True))
             here = mi.Vector4f(steps.x, steps.y, steps.z, -dr.dot(steps, at))
             is_other = mi.Bool(True)
             for each in known:
                 slope = mi.Vector3f(each.x, each.y, each.z)
                 away = dr.abs(dr.dot(slope, at) + each.w) > OTHER_DISTANCE
                 is_other &= away | (dr.abs(dr.dot(slope, steps)) < OTHER_COSINE)
-            apart = _separated(here, first)
+            apart = _separated(here, mi.Float(0), first)
             # The matrices are symmetric: they contain each pair twice.
             gain = mi.Float(dr.popcnt(apart & rest)) * 0.5
             score = gain + mi.Float(dr.popcnt(apart & ~pairs)) * (0.5 * HARM)
@@ -206,16 +212,60 @@ class CellSides:
             better = hit & (is_other | (gain > 0)) & (score > best)
             best = dr.select(better, score, best)
             plane = dr.select(better, here, plane)
+            point = dr.select(better, at, point)
             separated = dr.select(better, apart, separated)
             k += 1
-        return best, plane, separated
+        return best, plane, point, separated
+
+    @symbolic
+    def _curved(self, cell: mi.UInt32, plane: mi.Vector4f, point: mi.Point3f, active: mi.Bool):
+        """Determine the curvature of the surface at ``point`` from the normals of other hits.
+
+        Returns the linear terms and the curvature of the sphere that touches ``plane`` there. The
+        curvature is the slope of a linear regression of normals over positions.
+        """
+        first = self._first(cell)
+        normal = mi.Vector3f(plane.x, plane.y, plane.z)
+        starts, ends = _tables(FIRST_SEGMENTS)
+        k, count = mi.UInt32(0), dr.opaque(mi.UInt32, len(FIRST_SEGMENTS))
+        product, square = mi.Float(0), mi.Float(0)
+        while dr.hint(k < count, label="curvatures of cells"):
+            a, b = _segment(first, dr.gather(mi.UInt32, starts, k), dr.gather(mi.UInt32, ends, k))
+            at, other, hit = self._tangent(a, b, active)
+            hit &= dr.dot(other, normal) > CURVED_COSINE
+            away = at - point
+            product += dr.select(hit, dr.dot(other - normal, away), 0)
+            square += dr.select(hit, dr.squared_norm(away), 0)
+            k += 1
+        curvature = dr.clip(product / dr.maximum(square, 1e-6), -MOST_CURVED, MOST_CURVED)
+        # The sphere around the middle of the cell, where its quadratic term is 0.
+        off = first + 0.5 - point
+        slope = normal + curvature * off
+        rest = dr.dot(normal, off) + 0.5 * curvature * dr.squared_norm(off)
+        constant = rest - dr.dot(slope, first + 0.5)
+        return mi.Vector4f(slope.x, slope.y, slope.z, constant), curvature
+
+    @symbolic
+    def _tangent(self, a: mi.Point3f, b: mi.Point3f, active: mi.Bool):
+        """Return position and unit normal, in voxels, of the first surface between two positions,
+        and whether there is one.
+        """
+        distance, normal, hit = self._surface(a, b, active)
+        length = dr.norm(self._world(b) - self._world(a))
+        units = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+        slope = mi.Vector3f(
+            [dr.dot(normal, self._grid.world.vector(mi.Vector3f(*unit))) for unit in units]
+        )
+        return a + (b - a) * (distance / length), slope / dr.maximum(dr.norm(slope), 1e-30), hit
 
     # ------------------------------------------------------------------ corners
 
     def _set_simple(self, chosen: mi.UInt32) -> None:
         """Set the corners of cells that one plane describes completely."""
         first = self._first(dr.gather(mi.UInt32, self.found, chosen))
-        ahead, behind = _sides(dr.gather(mi.Vector4f, self.planes, chosen * PLANES), first)
+        plane = dr.gather(mi.Vector4f, self.planes, chosen * PLANES)
+        curvature = dr.gather(mi.Float, self.curvatures, chosen * PLANES)
+        ahead, behind = _sides(plane, curvature, first)
         dr.scatter(self.corners, ahead | (behind << 8), chosen * WORDS)
         dr.eval(self.corners)
 
@@ -271,7 +321,7 @@ class CellSides:
         """
         first = self._first(dr.gather(mi.UInt32, self.found, place))
         s = first + mi.Point3f(kronecker(sample, 3))
-        region = region_of(planes_of(self.planes, place), s)
+        region = region_of(planes_of(self.planes, self.curvatures, place), s, first + 0.5)
         seen, is_back, k = mi.UInt32(0), mi.Bool(False), mi.UInt32(0)
         while dr.hint(k < 8, label="visible corners"):
             towards = (1 + MARGIN) * (first + _corner(k) - s)
@@ -293,7 +343,7 @@ class CellSides:
         separate from it.
         """
         first = self._first(dr.gather(mi.UInt32, self.found, place))
-        planes = planes_of(self.planes, place)
+        planes = planes_of(self.planes, self.curvatures, place)
         rng = mi.PCG32(dr.width(place))
         s, corners = mi.Point3f(first), mi.UInt32(0)
         trial, step, active = mi.UInt32(0), mi.UInt32(0), mi.Bool(True)
@@ -301,7 +351,7 @@ class CellSides:
             searching = step % WALK == 0
             while dr.hint(searching, label="starts of walks"):
                 start = first + mi.Point3f(kronecker(trial, 3))
-                matches = region_of(planes, start) == region
+                matches = region_of(planes, start, first + 0.5) == region
                 s = dr.select(matches, start, s)
                 trial += 1
                 active &= trial < TRIALS
@@ -323,51 +373,66 @@ class CellSides:
         fewest, likely = mi.UInt32(PLANES + 1), mi.UInt32(0)
         for c in range(8):
             at = first + _corner(mi.UInt32(c))
-            crossed = dr.popcnt(region_of(planes, at) ^ region)
+            crossed = dr.popcnt(region_of(planes, at, first + 0.5) ^ region)
             likely = dr.select(crossed < fewest, 0, likely)
             likely |= dr.select(crossed <= fewest, mi.UInt32(1 << c), 0)
             fewest = dr.minimum(crossed, fewest)
         # Too small a region for any position may still contain corners.
         own = mi.UInt32(0xFF)
-        for k, plane in enumerate(planes):
-            ahead, behind = _sides(plane, first)
+        for k, (plane, curvature) in enumerate(planes):
+            ahead, behind = _sides(plane, curvature, first)
             own &= dr.select((region >> k) & 1 > 0, behind, ahead)
         own &= _seen_by(pairs, dr.minimum(dr.tzcnt(own), 7))
         likely = dr.select(own > 0, own, dr.select(is_open, likely, 0))
         return dr.select(corners > 0, corners, likely)
 
 
-def region_of(planes: Sequence[mi.Vector4f], s: mi.Point3f) -> mi.UInt32:
-    """Return the region of a cell that contains ``s``: bit k is set if it is behind plane k."""
-    region = mi.UInt32(0)
-    for k, plane in enumerate(planes):
-        region |= dr.select(_distance(plane, s) > 0, 0, mi.UInt32(1 << k))
+def region_of(
+    planes: Sequence[tuple[mi.Vector4f, mi.Float]], s: mi.Point3f, middle: mi.Point3f
+) -> mi.UInt32:
+    """Return the region, of the cell with this ``middle``, that contains ``s``: bit k is set if it
+    is behind plane k.
+    """
+    region, square = mi.UInt32(0), dr.squared_norm(s - middle)
+    for k, (plane, curvature) in enumerate(planes):
+        region |= dr.select(_distance(plane, curvature, s, square) > 0, 0, mi.UInt32(1 << k))
     return region
 
 
-def _distance(plane: mi.Vector4f, s: mi.Point3f) -> mi.Float:
-    """Return the distance of ``s`` [voxels] from a plane in the direction of its normal."""
-    return dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), s) + plane.w
+def _distance(plane: mi.Vector4f, curvature: mi.Float, s: mi.Point3f, square: mi.Float) -> mi.Float:
+    """Return the distance of ``s`` [voxels] from a plane in the direction of its normal, or a
+    number of the same sign if it is curved; ``square`` is the squared distance of ``s`` from the
+    middle of the cell.
+    """
+    return dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), s) + plane.w + 0.5 * curvature * square
 
 
-def planes_of(planes: mi.Float, place: mi.UInt32) -> list[mi.Vector4f]:
-    """Return the planes of cells, which are the records ``place``."""
-    return [dr.gather(mi.Vector4f, planes, place * PLANES + k) for k in range(PLANES)]
+def planes_of(
+    planes: mi.Float, curvatures: mi.Float, place: mi.UInt32
+) -> list[tuple[mi.Vector4f, mi.Float]]:
+    """Return the planes of cells, which are the records ``place``, and their curvatures."""
+    indices = [place * PLANES + k for k in range(PLANES)]
+    return [
+        (dr.gather(mi.Vector4f, planes, index), dr.gather(mi.Float, curvatures, index))
+        for index in indices
+    ]
 
 
-def _sides(plane: mi.Vector4f, first: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32]:
+def _sides(
+    plane: mi.Vector4f, curvature: mi.Float, first: mi.Point3f
+) -> tuple[mi.UInt32, mi.UInt32]:
     """Return the masks of the corners of a cell that lie ahead of and behind a plane."""
     ahead, behind = mi.UInt32(0), mi.UInt32(0)
     for c, corner in enumerate(CORNERS):
-        distance = _distance(plane, first + mi.Vector3f(*corner))
+        distance = _distance(plane, curvature, first + mi.Vector3f(*corner), mi.Float(0.75))
         ahead |= dr.select(distance > MARGIN, mi.UInt32(1 << c), 0)
         behind |= dr.select(distance < -MARGIN, mi.UInt32(1 << c), 0)
     return ahead, behind
 
 
-def _separated(plane: mi.Vector4f, first: mi.Point3f) -> mi.UInt64:
+def _separated(plane: mi.Vector4f, curvature: mi.Float, first: mi.Point3f) -> mi.UInt64:
     """Return the symmetric matrix of bits of the pairs of corners that a plane separates."""
-    ahead, behind = _sides(plane, first)
+    ahead, behind = _sides(plane, curvature, first)
     result = mi.UInt64(0)
     for c in range(8):
         row = dr.select((ahead >> c) & 1 > 0, behind, 0)

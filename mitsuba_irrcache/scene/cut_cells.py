@@ -42,8 +42,9 @@ class CutCells:
             return
         self._number = dr.zeros(mi.UInt32, int((self.grid.resolution - 1).prod()))
         dr.scatter(self._number, dr.arange(mi.UInt32, self.count) + 1, sides.found)
-        self._planes, self._corners = sides.planes, sides.corners
-        dr.eval(self._number, self._planes, self._corners)
+        self._planes, self._curvatures = sides.planes, sides.curvatures
+        self._corners = sides.corners
+        dr.eval(self._number, self._planes, self._curvatures, self._corners)
 
     @symbolic
     def corrected(
@@ -60,7 +61,8 @@ class CutCells:
         number = dr.gather(mi.UInt32, self._number, index, active)
         if active & (number > 0):
             record = number - 1
-            region = region_of(planes_of(self._planes, record), s)
+            planes = planes_of(self._planes, self._curvatures, record)
+            region = region_of(planes, s, cell + 0.5)
             word = dr.gather(mi.UInt32, self._corners, record * WORDS + region // PER_WORD)
             corners = word >> (8 * (region % PER_WORD))
             phi = self._mean(field, corners, s, lower, phi)

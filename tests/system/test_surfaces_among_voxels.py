@@ -267,6 +267,16 @@ def test_shapes_that_rays_hit_from_outside_only(scenes, tmp_path, kind):
     assert np.sqrt(np.square(difference).mean()) < 0.01
 
 
+def test_no_radiance_leaks_out_of_curved_shells(scenes):
+    """A ball that emits inwards only is black from outside: between surface and tangent planes, the
+    image had the irradiance of the interior.
+    """
+    shell = ball((0, 0, 0), 0.3, flip_normals=True) | luminous(0.5)
+    image, cache = rendered(scenes, {"fog": bound("cube", fog((1.0,) * 3)), "emitter": shell}, 16)
+    assert np.array(cache.irradiance).max() > 1
+    assert image.mean() < 1e-6
+
+
 def test_images_equal_those_of_volpath(scenes):
     """With a camera in the fog, several objects and a sun."""
     objects = {
