@@ -31,6 +31,10 @@ MAX_ORDER, TAIL_ORDER, MAX_TAIL = 6, 4, 0.07
 #: Maximum energy fraction of a truncated forward peak for orders 4 and 5, and for order 6. For
 #: ``hg`` they allow g up to 0.75 (order 4), 0.79 (5) and 0.85 (6).
 PEAK, LARGEST_PEAK = 0.25, 0.33
+#: Moments of a truncated peak beyond the order that is kept: at least, relative to the first one,
+#: and at most. Those of other sharp phase functions have both signs: tabulated steps, side
+#: scattering and rainbows were treated as peaks, with images that were wrong by up to a half.
+LEAST_OF_PEAK, MOST_OF_PEAK = -0.2, 1.2
 #: Magnitude of the moments g_l that are neglected: usually, with orders up to MAX_ORDER; and in
 #: isolated media without an uneven environment, with orders up to TAIL_ORDER. Where a camera sees
 #: light that is scattered backwards, with a black sky behind the medium, neglected moments of 0.03
@@ -116,7 +120,11 @@ class Phase:
     @property
     def has_peak(self) -> bool:
         """Whether the phase function is sharp because of a forward peak that can be truncated."""
-        return self.order is None and 0 < self.moments[MAX_ORDER + 1] <= LARGEST_PEAK
+        if self.order is not None:
+            return False
+        share, *beyond = self.moments[self._order_without_peak() + 1 :]
+        is_peak = LEAST_OF_PEAK * share <= min(beyond) and max(beyond) <= MOST_OF_PEAK * share
+        return 0 < share <= LARGEST_PEAK and is_peak
 
     def in_even_light(self) -> Phase:
         """Return the phase function for light of suns, points and uniform environments alone."""
@@ -126,12 +134,16 @@ class Phase:
 
     def without_peak(self) -> Phase:
         """Return the phase function with a truncated forward peak."""
-        orders = range(TAIL_ORDER, MAX_ORDER)
-        order = next((n for n in orders if self.moments[n + 1] <= PEAK), MAX_ORDER)
+        order = self._order_without_peak()
         share = float(self.moments[order + 1])
         known = np.arange(len(self.moments)) <= order
         moments = np.where(known, (self.moments - share) / (1 - share), 0)
         return Phase(self.plugin, moments, self.peak / (1 - share), share, self.moments)
+
+    def _order_without_peak(self) -> int:
+        """Return the order of the phase function if a forward peak is truncated."""
+        orders = range(TAIL_ORDER, MAX_ORDER)
+        return next((n for n in orders if self.moments[n + 1] <= PEAK), MAX_ORDER)
 
     def _peak_moments(self) -> np.ndarray:
         """Return the Legendre moments of the ``forward`` peak."""

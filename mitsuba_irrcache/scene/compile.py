@@ -94,7 +94,7 @@ def compile_scene(
             finest = (upper - lower).max() / STEPS_OF_A_SIDE
             _check_distance(medium.id(), np.abs([lower, upper]).max(), finest)
     for emitter in scene.emitters():
-        _warn_of_shared_texture(emitter)
+        _warn_of_texture(emitter)
         check_placement(emitter)
         _warn_of_weight(emitter)
         _warn_of_normals(emitter)
@@ -496,13 +496,21 @@ def _warn_of_directional_area(emitter: mi.Emitter) -> None:
         )
 
 
-def _warn_of_shared_texture(emitter: mi.Emitter) -> None:
-    """Log a warning for an emissive mesh with a texture if positions on it share texture
-    coordinates: Mitsuba samples one of them only.
+def _warn_of_texture(emitter: mi.Emitter) -> None:
+    """Log a warning for textured emitters that Mitsuba samples wrongly: cylinders, and meshes on
+    which positions share texture coordinates, of which it samples one only.
     """
     shape = emitter.get_shape()
     if shape is None or not varies_in_space(emitter):
         return
+    if shape.class_name() == "Cylinder":
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"irrcache: {described(shape)} is a cylinder whose radiance is a texture, which "
+            "Mitsuba samples with wrong densities, volpath as well: what it contributes to "
+            'surfaces, and to media with the solver "path", has errors of up to a third. Use a '
+            "mesh.",
+        )
     params = mi.traverse(shape)
     if "vertex_texcoords" not in params or not len(params["vertex_texcoords"]):
         return

@@ -366,10 +366,18 @@ def test_texels_of_different_colours(scenes, scale):
     assert np.abs(error).max() < 0.025
 
 
+#: Place of a cylinder of radius 0.15 and length 0.6.
+ALONG_Z = np.diag([0.15, 0.15, 0.6, 1.0])
+
+
 def shaped_lamp(kind: str, folder, emitter: dict) -> dict:
-    """Return a lamp in the middle: a sphere, or a square mesh with texture coordinates."""
+    """Return a lamp in the middle: a sphere, a cylinder, or a square mesh with texture
+    coordinates.
+    """
     if kind == "sphere":
         return {"type": "sphere", "radius": 0.3, "emitter": emitter}
+    if kind == "cylinder":
+        return {"type": "cylinder", "to_world": mi.ScalarTransform4f(ALONG_Z), "emitter": emitter}
     corners = [(-0.3, -0.3), (0.3, -0.3), (0.3, 0.3), (-0.3, 0.3)]
     lines = [f"v {x} 0 {y}" for x, y in corners] + ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
     file = folder / "square.obj"
@@ -378,8 +386,12 @@ def shaped_lamp(kind: str, folder, emitter: dict) -> dict:
 
 
 @pytest.mark.usefixtures("rgb")
-@pytest.mark.parametrize("kind", ["sphere", "mesh"])
-def test_textured_emitters_of_uniform_radiance(scenes, tmp_path, kind):
+@pytest.mark.parametrize(
+    # Voxels that the lamp cuts are noisy. Cylinders are sampled in the same way with a texture.
+    ("kind", "tolerance"),
+    [("sphere", 0.08), ("mesh", 0.08), ("cylinder", 1e-4)],
+)
+def test_textured_emitters_of_uniform_radiance(scenes, logged, tmp_path, kind, tolerance):
     """A texture of one colour gives the irradiance of that colour, after an edit, too."""
     pixels = mi.Bitmap(np.full((4, 4, 3), 2.0, np.float32))
     texture, found = {"type": "bitmap", "bitmap": pixels, "raw": True}, []
@@ -394,14 +406,18 @@ def test_textured_emitters_of_uniform_radiance(scenes, tmp_path, kind):
         params = mi.traverse(scene)
         if kind == "sphere":
             params["lamp.to_world"] = mi.ScalarTransform4f().translate([0, -0.2, 0]).scale(0.3)
+        elif kind == "cylinder":
+            moved = mi.ScalarTransform4f().translate([0, -0.2, 0])
+            params["lamp.to_world"] = moved @ mi.ScalarTransform4f(ALONG_Z)
         else:
             params["lamp.vertex_positions"] -= mi.Float([0, 0.2, 0] * 4)
         params.update()
         scenes.image(scene, spp=1)
         found.append(np.array(scene.integrator().cache.irradiance))
     for own, expected in ((found[0], found[2]), (found[1], found[3])):
-        # Voxels that the lamp cuts are noisy.
-        assert own.mean() == pytest.approx(expected.mean(), rel=0.08)
+        assert own.mean() == pytest.approx(expected.mean(), rel=tolerance)
+    # Mitsuba samples the textures of cylinders wrongly, so that volpath differs.
+    assert any("cylinder" in text for text in logged) == (kind == "cylinder")
 
 
 @pytest.mark.usefixtures("rgb")

@@ -203,14 +203,18 @@ def _sample_textured(
 
     Mitsuba samples textures in proportion to their luminance: few points then have the colour of
     darker texels. Half of the points are therefore sampled from the shape alone, ``by_shape``;
-    not those of spheres, whose samples have no texture coordinates.
+    not those of spheres, whose samples have no texture coordinates. All of those on cylinders are:
+    Mitsuba samples their textures with densities of other positions.
     """
     shape = emitter.get_shape()
     is_sphere = shape.shape_type() == int(mi.ShapeType.Sphere)
+    is_cylinder = shape.shape_type() == int(mi.ShapeType.Cylinder)
     record, irradiance = emitter.sample_direction(vertex, sample)
     other = shape.sample_direction(vertex, sample)
-    record = dr.select(by_shape & ~is_sphere, other, record)
-    density = emitter.pdf_direction(vertex, record) + shape.pdf_direction(vertex, record)
+    record = dr.select(is_cylinder | (by_shape & ~is_sphere), other, record)
+    of_shape = shape.pdf_direction(vertex, record)
+    of_texture = dr.select(is_cylinder, of_shape, emitter.pdf_direction(vertex, record))
+    density = of_texture + of_shape
     radiance = emitter.eval_direction(vertex, record)
     mixture = dr.select(density > 0, radiance * 2 / density, 0)
     return record, dr.select(is_sphere, irradiance, mixture)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import UnsupportedSceneError
-from mitsuba_irrcache.media.phase import LARGEST_PEAK, PEAK, Phase
+from mitsuba_irrcache.media.phase import LARGEST_PEAK, PEAK, Phase, legendre_moments
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.transport.path import Media
 
@@ -41,6 +41,24 @@ def test_scaled_phase_function_plus_peak_has_the_original_moments(g):
 def test_only_forward_peaks_are_scaled():
     for g in (0.5, -0.8, 0.9, 0.0):
         assert not moments(g).has_peak
+
+
+TABLES = {
+    "step": (lambda c: np.where(c > 0.5, 1, 0.05), False),
+    "sideways": (lambda c: np.exp(-8 * c**2) + 0.02, False),
+    "rainbow": (lambda c: 0.2 + 3 * np.exp(-(((c + 0.74) / 0.08) ** 2)), False),
+    "corona and glory": (lambda c: 0.1 + 8 * np.exp((c - 1) / 0.05) + np.exp(-(1 + c) * 10), True),
+}
+
+
+@pytest.mark.parametrize(("values", "has_peak"), TABLES.values(), ids=TABLES)
+def test_other_sharp_phase_functions_have_no_forward_peak(values, has_peak):
+    """A moment of any sign beyond the order counted as a peak: images had half their radiance."""
+    table = ",".join(f"{v:.5f}" for v in values(np.linspace(-1, 1, 33)))
+    plugin = mi.load_dict({"type": "tabphase", "values": table})
+    phase = Phase(plugin, *legendre_moments(plugin, 32))
+    assert phase.order is None
+    assert phase.has_peak == has_peak
 
 
 def scene_of(scenes, settings: dict, **objects) -> mi.Scene:
