@@ -55,6 +55,9 @@ SMALL_ANGLE = 1e-6
 TESTS = 2048
 #: Number of positions on an emitter at which it is tested whether it lies in the medium.
 POSITIONS = 64
+#: Ratio of an emitter's radius to its distance from the centre of a medium above which it counts as
+#: wide: a forward peak then selects a few of the directions over which transmittances are averaged.
+WIDE = 1.15
 #: Maximum number of emitters treated in this way, maximum number of their values at all voxels, and
 #: number of values per voxel and emitter without its moments. The irradiance of further emitters is
 #: interpolated.
@@ -108,6 +111,7 @@ class AreaLight(DirectLight):
         self._largest_extinction = dr.opaque(mi.Float, medium.sigma_t.maximum)
         super().__init__(scene, emitter, medium, grid, voxels, classes)
         self.maximum = 2 * dr.pi * max(float(c[0]) for c in self._radiance)
+        self.is_wide = bool(medium.phase.forward) and _is_wide(self._shape, grid)
 
     # docs/primer, eq. (2.9)
 
@@ -522,6 +526,14 @@ def area_lights_of(
     values = (VALUES + channels * order * (order + 2)) * dr.width(voxels)
     count = min(MOST_LIGHTS, MOST_VALUES // values)
     return [AreaLight(scene, e, medium, grid, voxels, classes, samples) for e in lights[:count]]
+
+
+def _is_wide(shape: mi.Shape, grid: Grid) -> bool:
+    """Return whether an emitter with this shape is wide as seen from the centre of ``grid``."""
+    centre = grid.world.matrix @ [*(0.5 * grid.resolution), 1.0]
+    ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
+    radius = 0.5 * float(np.linalg.norm(ends[1] - ends[0]))
+    return radius > WIDE * float(np.linalg.norm(ends.mean(axis=0) - centre[:3]))
 
 
 def _mean_and_bias(

@@ -75,6 +75,9 @@ class DirectLight:
         ``classes`` is None if there are no surfaces and other media among the voxels. ``pause`` is
         called between kernel launches and may raise an exception.
         """
+        #: whether moments alone represent its radiance, and what a forward peak scatters of it
+        #: counts as unscattered
+        self.is_wide = False
         #: order of `angular_means`
         self.order = order_of_direct_light(medium.phase)
         self._kind = kind_of(emitter)
@@ -460,7 +463,7 @@ class DirectLightAlongRays:
             return maximum(gain + basis.phase.aureole.correction(cosine, depth), 0.0)
         view = direction, basis.basis(direction)
         smooth = self._moments.factor(p, *view, mi.Bool(True), with_peak)
-        if not basis.has_residual(with_peak):
+        if light.is_wide or not basis.has_residual(with_peak):
             return smooth
         if peak_depth is not None and basis.phase.forward:
             peak_depth = light.peak_depth(p) + peak_depth

@@ -230,7 +230,8 @@ class CoupledMedium:
         active = cache.active
         for light, own in lights:
             irradiance = spread(self.grid, active, [light.irradiance[channel]], None)
-            narrow[_index(sources, own)] = irradiance
+            if not light.is_wide:
+                narrow[_index(sources, own)] = irradiance
             if not own.sharp:
                 means = [
                     spread(self.grid, active, [mean[channel]], None)

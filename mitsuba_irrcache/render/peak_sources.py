@@ -35,7 +35,7 @@ class PeakSources:
         if not peaked:
             return None
         lights = [along_rays.light for p in peaked for along_rays in p.direct_lights]
-        area_lights = [light for light in lights if isinstance(light, AreaLight)]
+        area_lights = [x for x in lights if isinstance(x, AreaLight) and not x.is_wide]
         return cls(peaked[0].directional.directional, area_lights)
 
     def include(

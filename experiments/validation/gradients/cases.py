@@ -437,7 +437,7 @@ def _exact(case: Case) -> dict:
     """Settings with which differences among surfaces have a noise of about 1 %."""
     single = case.max_depth == 2
     return {
-        "directions": 512 if case.g else 256,
+        "directions": (2048 if case.g > 0.8 else 512) if case.g else 256,
         # Single scattering is nearly free of noise, and larger steps are one-sided.
         "step": 0.05 if single else 0.12,
         # With 64 samples, differences for g = 0.85 are wrong by up to 8 %.
