@@ -366,7 +366,8 @@ class CachedMedium:
         known = [light.emitter for light in direct_lights]
         falloff = InverseSquareFactor.of(scene, grid, known)
         if known:
-            basis = _angular_basis(scene, medium, known)
+            wide = [light.emitter for light in direct_lights if light.is_wide]
+            basis = _angular_basis(scene, medium, known, wide)
         moments = basis.count if basis is not None else 0
         peak_depths = None
         if medium.original is not None and basis.sources and dr.width(active):
@@ -636,16 +637,21 @@ class CachedMedium:
 
 
 def _angular_basis(
-    scene: mi.Scene, medium: MediumGrid, known: Sequence[mi.Emitter] = ()
+    scene: mi.Scene,
+    medium: MediumGrid,
+    known: Sequence[mi.Emitter] = (),
+    wide: Sequence[mi.Emitter] = (),
 ) -> AngularBasis | None:
     """Create the angular basis of anisotropic scattering in a scene; None if it is isotropic.
 
     The emitters ``known``, whose irradiance camera rays evaluate in closed form, are not among its
-    sources.
+    sources; those that are ``wide`` are not narrow either.
     """
     if medium.phase.is_isotropic:
         return None
-    return AngularBasis(medium.phase, *sources_of(scene, known))
+    sources, _ = sources_of(scene, known)
+    _, others = sources_of(scene, [emitter for emitter in known if emitter not in wide])
+    return AngularBasis(medium.phase, sources, others)
 
 
 def _is_within(medium: MediumGrid, emitter: mi.Emitter) -> bool:
