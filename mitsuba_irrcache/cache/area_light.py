@@ -15,6 +15,7 @@ They are also defined behind a flat emitter, and continuous across its plane.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import drjit as dr
@@ -34,6 +35,7 @@ from mitsuba_irrcache.grids.root_field import ExtendedField
 from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
 from mitsuba_irrcache.lights.solid_angle import SolidAngle
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.occluders import bounding_sphere, boxes_meet
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import GAUSS_POINTS, medium_transmittance
@@ -55,9 +57,11 @@ SMALL_ANGLE = 1e-6
 TESTS = 2048
 #: Number of positions on an emitter at which it is tested whether it lies in the medium.
 POSITIONS = 64
-#: Ratio of an emitter's radius to its distance from the centre of a medium above which it counts as
-#: wide: a forward peak then selects a few of the directions over which transmittances are averaged.
-WIDE = 1.15
+#: Ratio of an emitter's radius to its distance from the farthest position in a medium above which
+#: it counts as wide: a forward peak then selects a few of the directions over which transmittances
+#: are averaged. For squares at distance 3 from the centre of a cube of half-edge 1, the RMSE of
+#: images is smaller with edges above 4.5.
+WIDE = 0.7
 #: Maximum number of emitters treated in this way, maximum number of their values at all voxels, and
 #: number of values per voxel and emitter without its moments. The irradiance of further emitters is
 #: interpolated.
@@ -111,7 +115,7 @@ class AreaLight(DirectLight):
         self._largest_extinction = dr.opaque(mi.Float, medium.sigma_t.maximum)
         super().__init__(scene, emitter, medium, grid, voxels, classes)
         self.maximum = 2 * dr.pi * max(float(c[0]) for c in self._radiance)
-        self.is_wide = bool(medium.phase.forward) and _is_wide(self._shape, grid)
+        self.is_wide = bool(medium.phase.forward) and _is_wide(self._shape, medium, grid)
 
     # docs/primer, eq. (2.9)
 
@@ -528,12 +532,15 @@ def area_lights_of(
     return [AreaLight(scene, e, medium, grid, voxels, classes, samples) for e in lights[:count]]
 
 
-def _is_wide(shape: mi.Shape, grid: Grid) -> bool:
-    """Return whether an emitter with this shape is wide as seen from the centre of ``grid``."""
-    centre = grid.world.matrix @ [*(0.5 * grid.resolution), 1.0]
+def _is_wide(shape: mi.Shape, medium: MediumGrid, grid: Grid) -> bool:
+    """Return whether an emitter with this shape is wide as seen from all positions in a medium."""
     ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
+    corners = np.array(list(itertools.product(*ends.T)))
+    if boxes_meet(grid, np.zeros(3), grid.resolution, corners):
+        return False
+    centre, extent = bounding_sphere(medium.frame)
     radius = 0.5 * float(np.linalg.norm(ends[1] - ends[0]))
-    return radius > WIDE * float(np.linalg.norm(ends.mean(axis=0) - centre[:3]))
+    return radius > WIDE * (float(np.linalg.norm(ends.mean(axis=0) - centre)) + extent)
 
 
 def _mean_and_bias(

@@ -155,7 +155,7 @@ class CellSides:
         for number in range(PLANES):
             pairs, rest = (dr.gather(mi.UInt64, values, chosen) for values in (blocked, left))
             cell = dr.gather(mi.UInt32, self.found, chosen)
-            known = [plane for plane, _ in planes_of(self.planes, self.curvatures, chosen)]
+            known = planes_of(self.planes, self.curvatures, chosen)
             score, plane, point, separated = self._best_plane(cell, pairs, rest, known)
             is_new = score > -dr.inf
             dr.eval(is_new, plane, point, separated)
@@ -180,7 +180,11 @@ class CellSides:
 
     @symbolic
     def _best_plane(
-        self, cell: mi.UInt32, pairs: mi.UInt64, rest: mi.UInt64, known: list[mi.Vector4f]
+        self,
+        cell: mi.UInt32,
+        pairs: mi.UInt64,
+        rest: mi.UInt64,
+        known: list[tuple[mi.Vector4f, mi.Float]],
     ):
         """Choose a tangent plane of a surface that segments between corners hit.
 
@@ -200,10 +204,12 @@ class CellSides:
             at, steps, hit = self._tangent(a, b, mi.Bool(True))
             here = mi.Vector4f(steps.x, steps.y, steps.z, -dr.dot(steps, at))
             is_other = mi.Bool(True)
-            for each in known:
-                slope = mi.Vector3f(each.x, each.y, each.z)
-                away = dr.abs(dr.dot(slope, at) + each.w) > OTHER_DISTANCE
-                is_other &= away | (dr.abs(dr.dot(slope, steps)) < OTHER_COSINE)
+            for each, curvature in known:
+                off = at - middle
+                distance = _distance(each, curvature, at, dr.squared_norm(off))
+                slope = mi.Vector3f(each.x, each.y, each.z) + curvature * off
+                cosine = dr.abs(dr.dot(slope, steps)) / dr.maximum(dr.norm(slope), 1e-30)
+                is_other &= (dr.abs(distance) > OTHER_DISTANCE) | (cosine < OTHER_COSINE)
             apart = _separated(here, mi.Float(0), first)
             # The matrices are symmetric: they contain each pair twice.
             gain = mi.Float(dr.popcnt(apart & rest)) * 0.5
