@@ -61,6 +61,8 @@ LARGEST_OFFSET = 0.002
 #: Relative difference of the cosines of face normals and interpolated normals of an emissive mesh,
 #: averaged over its area, above which a warning is logged.
 MOST_LOST = 0.02
+#: Classes of shapes on which Mitsuba samples no positions.
+NOT_SAMPLED = "BSplineCurve", "LinearCurve", "Ellipsoids"
 #: Area of the faces of an emissive mesh in its texture above which they must overlap there, and
 #: tolerance of texture coordinates.
 LARGEST_TEXTURE, SLACK = 1.001, 1e-3
@@ -99,7 +101,7 @@ def compile_scene(
         _warn_of_weight(emitter)
         _warn_of_normals(emitter)
         _warn_of_directional_area(emitter)
-        _check_radiance(emitter)
+        _check_samples(emitter)
     _warn_of_lost_bounds(scene)
     for sensor in scene.sensors():
         check_sensor(scene, sensor)
@@ -473,8 +475,16 @@ def _warn_of_weight(emitter: mi.Emitter) -> None:
         )
 
 
-def _check_radiance(emitter: mi.Emitter) -> None:
-    """Refuse emitters whose radiance Mitsuba evaluates to 0 wherever it samples a position."""
+def _check_samples(emitter: mi.Emitter) -> None:
+    """Refuse emitters that Mitsuba cannot sample, or whose radiance it evaluates to 0 wherever it
+    samples a position.
+    """
+    shape = emitter.get_shape()
+    if shape is not None and shape.class_name() in NOT_SAMPLED:
+        raise UnsupportedSceneError(
+            f"irrcache: {described(shape)} emits, and Mitsuba cannot sample positions on such "
+            "shapes. Use a mesh, cylinders or spheres, or remove the emitter."
+        )
     texture = children(emitter).get("radiance")
     if texture is not None and texture.class_name() == "MeshAttribute":
         raise UnsupportedSceneError(

@@ -436,6 +436,19 @@ def test_shared_texture_coordinates_of_an_emitter_are_warned_of(scenes, logged):
 
 
 @pytest.mark.usefixtures("rgb")
+def test_emitters_that_mitsuba_does_not_sample_are_refused(scenes, tmp_path):
+    points = tmp_path / "curve.txt"
+    points.write_text("\n".join(f"{x} 1.5 0 0.1" for x in (-1.0, -0.5, 0.0, 0.5, 1.0)))
+    curve = {"type": "bsplinecurve", "filename": str(points), "emitter": {"type": "area"}}
+    fog = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "auto"}, None, fog=fog, lamp=curve, emitter=None
+    )
+    with pytest.raises(Exception, match=r'"lamp" .*cannot sample positions'):
+        scenes.image(scene, spp=1)
+
+
+@pytest.mark.usefixtures("rgb")
 @pytest.mark.parametrize(("radius", "is_noisy"), [(0.1, True), (1.0, False)])
 def test_more_samples_where_few_meet_a_lamp(scenes, radius, is_noisy):
     """The default number of samples grows where the roots of noisy voxels would be too small on
