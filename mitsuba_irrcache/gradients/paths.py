@@ -360,6 +360,9 @@ class TracedPaths:
         """Sample an emitter: the record, radiance over density, shadow ray and transmittance."""
         record, emitter = self._scene.sample_emitter_direction(origin, sample, False, active)
         active = active & (record.pdf > 0)
+        # Where environments are black Mitsuba may divide 0 by 0.
+        record.d = dr.select(active & dr.all(dr.isfinite(record.d)), record.d, mi.Vector3f(0, 0, 1))
+        emitter = dr.select(active, emitter, 0)
         if not self._emitters:  # the derivative with respect to a radiance of 0 is not 0
             active = active & (dr.max(dr.abs(emitter)) > 0)
         shadow = mi.Ray3f(origin.spawn_ray_to(record.p))
