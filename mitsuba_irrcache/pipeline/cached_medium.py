@@ -649,8 +649,9 @@ def _angular_basis(
     """
     if medium.phase.is_isotropic:
         return None
-    sources, _ = sources_of(scene, known)
-    _, others = sources_of(scene, [emitter for emitter in known if emitter not in wide])
+    sources, others = sources_of(scene, known)
+    if wide:
+        _, others = sources_of(scene, [emitter for emitter in known if emitter not in wide])
     return AngularBasis(medium.phase, sources, others)
 
 
