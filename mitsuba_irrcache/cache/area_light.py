@@ -15,7 +15,6 @@ They are also defined behind a flat emitter, and continuous across its plane.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 
 import drjit as dr
@@ -35,7 +34,7 @@ from mitsuba_irrcache.grids.root_field import ExtendedField
 from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
 from mitsuba_irrcache.lights.solid_angle import SolidAngle
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.occluders import bounding_sphere, boxes_meet
+from mitsuba_irrcache.scene.occluders import bounding_sphere, may_meet
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import GAUSS_POINTS, medium_transmittance
@@ -534,11 +533,10 @@ def area_lights_of(
 
 def _is_wide(shape: mi.Shape, medium: MediumGrid, grid: Grid) -> bool:
     """Return whether an emitter with this shape is wide as seen from all positions in a medium."""
-    ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
-    corners = np.array(list(itertools.product(*ends.T)))
-    if boxes_meet(grid, np.zeros(3), grid.resolution, corners):
+    if may_meet(shape, grid, np.zeros(3), grid.resolution):
         return False
     centre, extent = bounding_sphere(medium.frame)
+    ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
     radius = 0.5 * float(np.linalg.norm(ends[1] - ends[0]))
     return radius > WIDE * (float(np.linalg.norm(ends.mean(axis=0) - centre)) + extent)
 

@@ -269,8 +269,7 @@ class CellSides:
     def _set_simple(self, chosen: mi.UInt32) -> None:
         """Set the corners of cells that one plane describes completely."""
         first = self._first(dr.gather(mi.UInt32, self.found, chosen))
-        plane = dr.gather(mi.Vector4f, self.planes, chosen * PLANES)
-        curvature = dr.gather(mi.Float, self.curvatures, chosen * PLANES)
+        (plane, curvature), *_ = planes_of(self.planes, self.curvatures, chosen)
         ahead, behind = _sides(plane, curvature, first)
         dr.scatter(self.corners, ahead | (behind << 8), chosen * WORDS)
         dr.eval(self.corners)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -40,7 +39,7 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
     inside of it; parts of other shapes are found by `DETECTING_RAYS`^2 rays through each face of a
     voxel.
     """
-    near = [s for s in scene.shapes() if is_surface(s) and _may_meet(s, grid, lower, upper)]
+    near = [s for s in scene.shapes() if is_surface(s) and may_meet(s, grid, lower, upper)]
     for shape in near:
         if _is_partly_within(shape, grid, lower, upper):
             return described(shape)
@@ -77,7 +76,7 @@ def rays_through_faces(
     return grid.world.point(start), grid.world.point(stop)
 
 
-def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
+def may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
     """Return whether the bounds of a shape overlap the box."""
     box = shape.bbox()
     ends = np.array([box.min, box.max], dtype=np.float64)
@@ -232,9 +231,7 @@ def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str 
         outside, inside = (_is_medium(side, medium) for side in sides)
         if not flags_of(shape) & int(mi.BSDFFlags.Null) or inside or not outside:
             continue
-        ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
-        corners = np.array(list(itertools.product(*ends.T)))
-        if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
+        if may_meet(shape, grid, *box):
             return described(shape)
     return None
 
