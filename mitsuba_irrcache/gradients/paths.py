@@ -23,6 +23,7 @@ from mitsuba_irrcache.transport.path import (
     position_on,
     power_heuristic,
     visibility,
+    with_valid_direction,
 )
 
 #: Number of surfaces of a path, at most, and after which Russian roulette ends paths; smallest
@@ -359,9 +360,8 @@ class TracedPaths:
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Ray3f, mi.Spectrum]:
         """Sample an emitter: the record, radiance over density, shadow ray and transmittance."""
         record, emitter = self._scene.sample_emitter_direction(origin, sample, False, active)
+        record = with_valid_direction(record)
         active = active & (record.pdf > 0)
-        # Where environments are black Mitsuba may divide 0 by 0.
-        record.d = dr.select(active & dr.all(dr.isfinite(record.d)), record.d, mi.Vector3f(0, 0, 1))
         emitter = dr.select(active, emitter, 0)
         if not self._emitters:  # the derivative with respect to a radiance of 0 is not 0
             active = active & (dr.max(dr.abs(emitter)) > 0)
